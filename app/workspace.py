@@ -1,0 +1,109 @@
+"""Every path that a run reads or writes, writes that appear whole or not at all, and the lock."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from app.errors import CityReconError, InputError
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """The folder that holds all products of one run.
+
+    ``capture/ sfm/ georegister/ clusters/ selection/ dense/ fused/ batch/ compare/``: one folder per stage, each
+    complete (it holds its stage's ``record.json``) or absent; ``*.partial`` is work under way.
+    """
+
+    root: Path
+
+    @property
+    def log_file(self) -> Path:
+        """Full log of all commands run on this workspace."""
+        return self.root / "cityrecon.log"
+
+    @property
+    def inventory_file(self) -> Path:
+        """The capture stage's product."""
+        return self.root / "capture" / "inventory.json"
+
+    @property
+    def sfm_model(self) -> Path:
+        """COLMAP model in its own frame and scale."""
+        return self.root / "sfm" / "model"
+
+    @property
+    def georegistered_model(self) -> Path:
+        """COLMAP model, z up, in metres when the scale is known."""
+        return self.root / "georegister" / "model"
+
+    @property
+    def georeference_file(self) -> Path:
+        """Origin, CRS and the sources of scale and gravity."""
+        return self.root / "georegister" / "georeference.json"
+
+    @property
+    def clusters_file(self) -> Path:
+        """One cluster per line."""
+        return self.root / "clusters" / "clusters.jsonl"
+
+    @property
+    def selection_file(self) -> Path:
+        """One cluster's selected views per line."""
+        return self.root / "selection" / "selection.jsonl"
+
+    def cluster_dir(self, cluster: str) -> Path:
+        """COLMAP dense workspace of one cluster."""
+        return self.root / "dense" / cluster
+
+    def cluster_cloud(self, cluster: str) -> Path:
+        """A cluster's cloud, cropped to its cells."""
+        return self.root / "fused" / "clusters" / f"{cluster}.ply"
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Hold the workspace; the operating system lets go when the process ends, however it ends.
+
+        Raises:
+            InputError: the workspace can't be created or written.
+            CityReconError: another run holds it.
+        """
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+            handle = os.open(self.root / ".lock", os.O_RDWR | os.O_CREAT, 0o666)
+        except OSError as error:
+            raise InputError(f"cannot write workspace {self.root}: {error.strerror}; choose another with --workspace") from error
+        try:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                raise CityReconError(f"another run is using workspace {self.root}; wait for it or choose another with --workspace") from error
+            yield
+        finally:
+            os.close(handle)
+
+
+@contextmanager
+def atomic_file(path: Path) -> Iterator[Path]:
+    """Yield a path beside ``path`` to write; it replaces ``path`` on success and is removed on failure."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        yield partial
+        with partial.open("rb") as handle:
+            os.fsync(handle.fileno())
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def remove_tree(path: Path) -> None:
+    """Remove a folder and all in it, if there."""
+    if path.exists():
+        shutil.rmtree(path)
