@@ -47,7 +47,7 @@ class MvsJob:
     """One cluster to reconstruct: a COLMAP dense workspace and the region of space that is wanted from it."""
 
     workspace: Path
-    """COLMAP dense workspace: `images/`, `sparse/` (PINHOLE cameras), `stereo/`."""
+    """COLMAP dense workspace: `images/` (already at the size to work at), `sparse/` (PINHOLE cameras), `stereo/`."""
     views: tuple[MvsView, ...]
     """Reference views, sorted by name."""
     sources: tuple[tuple[int, ...], ...]
@@ -80,16 +80,12 @@ class MvsOptions:
 
     preset: Preset = Preset.NORMAL
     """Time against quality."""
-    max_image_size_px: int = 0
-    """Longer image side that stereo works at; larger images are reduced. 0: no limit."""
     num_source_views: int = 0
     """Source views per reference view. 0: the preset's own number."""
     seed: int = 0
     """Seed of the random search; same seed, same bytes, for any number of threads."""
 
     def __post_init__(self) -> None:
-        if self.max_image_size_px < 0:
-            raise ValueError(f"max_image_size_px must be at least 0, not {self.max_image_size_px}")
         if self.num_source_views < 0:
             raise ValueError(f"num_source_views must be at least 0, not {self.num_source_views}")
 
