@@ -101,8 +101,8 @@ def _record_type(has_normals: bool, has_colors: bool) -> np.dtype[np.void]:
 class PlyWriter:
     """Write a binary PLY file piece by piece; the number of points need not be known beforehand.
 
-    The count goes into the header when the block ends without an error; a comment line takes up the slack, so the header
-    keeps its length. After an error the file says that it has no points.
+    The count goes into the header when the block ends without an error; a comment line takes up the slack, so the
+    header keeps its length. After an error the file says that it has no points.
 
     Example:
         with PlyWriter(path, has_normals=True, has_colors=True) as writer:
@@ -262,7 +262,7 @@ def _cloud_of_columns(columns: dict[str, NDArray[np.generic]], path: Path) -> Po
     if not np.isfinite(points.astype(np.float64)).all():
         raise CloudFormatError(f"{path}: some points have coordinates that aren't finite; remove them first")
     if colors is not None and colors.dtype != np.uint8:
-        scale = 255.0 if np.issubdtype(colors.dtype, np.floating) else 255.0 / np.iinfo(colors.dtype).max
+        scale = 255.0 if colors.dtype.kind == "f" else 255.0 / np.iinfo(colors.dtype.str).max
         colors = np.rint(np.clip(colors.astype(np.float64) * scale, 0, 255))
     return PointCloud(
         points.astype(np.float32),
@@ -274,7 +274,8 @@ def _cloud_of_columns(columns: dict[str, NDArray[np.generic]], path: Path) -> Po
 def read_ply_chunks(path: Path, chunk_points: int = _CHUNK_POINTS) -> Iterator[PointCloud]:
     """Read the vertices of a PLY file piece by piece, at most `chunk_points` at a time.
 
-    Binary (either byte order) and ASCII files, coordinates of any number type; other elements and properties are skipped.
+    Binary files of either byte order and ASCII files, coordinates of any number type; other elements and properties are
+    skipped.
 
     Raises:
         CloudFormatError: Not a PLY file, damaged, cut short, without points, or with coordinates that aren't finite.
