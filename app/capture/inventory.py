@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
+import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
+
+from app.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,7 +21,7 @@ class CameraEntry:
     height: int
     num_images: int
     focal_prior_px: float | None = None
-    """From EXIF (35 mm equivalent), if there."""
+    """From EXIF (35 mm equivalent or COLMAP's list of sensors), if there."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,9 +33,11 @@ class FrameEntry:
     images: dict[str, str]
     """Camera name to image name (relative to the image root, with `/`)."""
     gps: tuple[float, float, float] | None = None
-    """WGS84 latitude and longitude in degrees, ellipsoidal height in metres."""
+    """WGS84 latitude and longitude in degrees, height in metres (NaN when the source gives none)."""
     position_m: tuple[float, float, float] | None = None
-    """Cartesian position prior (from TUM or KITTI pose files)."""
+    """Cartesian position prior (from a pose file)."""
+    time_s: float | None = None
+    """Seconds since the start of the video."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +48,8 @@ class ImageEntry:
     size_bytes: int
     digest: str
     """Hash of size and first 64 KiB: tells changed images without reading them all."""
+    has_mask: bool = False
+    """There is a mask `mask_root/NAME.png` of the same size."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,41 +57,68 @@ class Inventory:
     """The capture stage's product. Frames are in order of capture, images sorted by name."""
 
     image_root: Path
-    """Absolute. The user's folder, or the workspace's `capture/frames` for videos."""
+    """Absolute. The user's folder, or `frames` beside the inventory for videos.
+
+    In the JSON file a root inside the inventory's folder is stored relative to it, so that the folder may be renamed;
+    `read` makes it absolute again.
+    """
     cameras: tuple[CameraEntry, ...]
+    """In natural order of names."""
     frames: tuple[FrameEntry, ...]
     images: tuple[ImageEntry, ...]
     is_rig: bool
     """The cameras move as one rig, and each frame's images were taken at the same time."""
     rig_file: Path | None = None
-    """COLMAP rig_config.json with known extrinsics, if given."""
+    """Absolute. COLMAP rig_config.json with known extrinsics, if given."""
     mask_root: Path | None = None
     """Absolute. COLMAP's naming: `mask_root/NAME.png`."""
     video_frame_interval_s: float | None = None
+    """Time between frames that were looked at, when they come from videos sampled by time."""
 
     def write(self, path: Path) -> None:
         """Write as JSON."""
-        path.write_text(json.dumps(asdict(self), indent=1, default=str) + "\n", encoding="utf-8")
+        data = asdict(self)
+        if self.image_root.is_relative_to(path.parent.absolute()):
+            data["image_root"] = self.image_root.relative_to(path.parent.absolute())
+        for frame in data["frames"]:
+            if frame["gps"] and math.isnan(frame["gps"][2]):
+                frame["gps"] = (*frame["gps"][:2], None)
+        path.write_text(json.dumps(data, indent=1, default=str, allow_nan=False) + "\n", encoding="utf-8")
 
     @classmethod
     def read(cls, path: Path) -> Inventory:
-        """Read what `write` wrote."""
-        data = json.loads(path.read_text(encoding="utf-8"))
-        return cls(
-            image_root=Path(data["image_root"]),
-            cameras=tuple(CameraEntry(**camera) for camera in data["cameras"]),
-            frames=tuple(
-                FrameEntry(
-                    name=frame["name"],
-                    images=frame["images"],
-                    gps=tuple(frame["gps"]) if frame["gps"] else None,
-                    position_m=tuple(frame["position_m"]) if frame["position_m"] else None,
-                )
-                for frame in data["frames"]
-            ),
-            images=tuple(ImageEntry(**image) for image in data["images"]),
-            is_rig=data["is_rig"],
-            rig_file=Path(data["rig_file"]) if data["rig_file"] else None,
-            mask_root=Path(data["mask_root"]) if data["mask_root"] else None,
-            video_frame_interval_s=data["video_frame_interval_s"],
-        )
+        """Read what `write` wrote.
+
+        Raises:
+            InputError: the file is missing or isn't an inventory.
+        """
+        try:
+            data = json.loads(path.read_text(encoding="utf-8"))
+            return cls(
+                image_root=Path(os.path.normpath(path.parent.absolute() / data["image_root"])),
+                cameras=tuple(CameraEntry(**camera) for camera in data["cameras"]),
+                frames=tuple(
+                    FrameEntry(
+                        name=frame["name"],
+                        images=frame["images"],
+                        gps=_gps_from_json(frame["gps"]),
+                        position_m=tuple(frame["position_m"]) if frame["position_m"] else None,
+                        time_s=frame["time_s"],
+                    )
+                    for frame in data["frames"]
+                ),
+                images=tuple(ImageEntry(**image) for image in data["images"]),
+                is_rig=data["is_rig"],
+                rig_file=Path(data["rig_file"]) if data["rig_file"] else None,
+                mask_root=Path(data["mask_root"]) if data["mask_root"] else None,
+                video_frame_interval_s=data["video_frame_interval_s"],
+            )
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"cannot read the inventory {path}: {error}; run the capture stage again") from error
+
+
+def _gps_from_json(gps: list[float | None] | None) -> tuple[float, float, float] | None:
+    if gps is None:
+        return None
+    lat, lon, height = (math.nan if value is None else value for value in gps)
+    return lat, lon, height
