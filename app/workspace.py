@@ -17,8 +17,8 @@ from app.errors import CityReconError, InputError
 class Workspace:
     """The folder that holds all products of one run.
 
-    ``capture/ sfm/ georegister/ clusters/ selection/ dense/ fused/ batch/ compare/``: one folder per stage, each
-    complete (it holds its stage's ``record.json``) or absent; ``*.partial`` is work under way.
+    ``capture/ sfm/ georegister/ clusters/ selection/``, ``jobs/``, ``dense/CLUSTER/ fused/CLUSTER/``, and
+    the same under ``batch/``: each is complete (it holds a ``record.json``) or absent; ``*.partial`` is work under way.
     """
 
     root: Path
@@ -27,6 +27,11 @@ class Workspace:
     def log_file(self) -> Path:
         """Full log of all commands run on this workspace."""
         return self.root / "cityrecon.log"
+
+    @property
+    def config_file(self) -> Path:
+        """Options in force at the last command."""
+        return self.root / "config.toml"
 
     @property
     def inventory_file(self) -> Path:
@@ -58,13 +63,15 @@ class Workspace:
         """One cluster's selected views per line."""
         return self.root / "selection" / "selection.jsonl"
 
-    def cluster_dir(self, cluster: str) -> Path:
-        """COLMAP dense workspace of one cluster."""
-        return self.root / "dense" / cluster
+    @property
+    def cloud_file(self) -> Path:
+        """The merged cloud, unless the user names another place."""
+        return self.root / "cloud.ply"
 
-    def cluster_cloud(self, cluster: str) -> Path:
-        """A cluster's cloud, cropped to its cells."""
-        return self.root / "fused" / "clusters" / f"{cluster}.ply"
+    @property
+    def batch_cloud_file(self) -> Path:
+        """Cloud of the batch reconstruction."""
+        return self.root / "batch" / "cloud.ply"
 
     @contextmanager
     def lock(self) -> Iterator[None]:

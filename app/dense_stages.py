@@ -1,0 +1,193 @@
+"""Dense stages on a workspace: per cluster, merged into the city, and the whole set at once for comparison."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pycolmap
+
+from app.capture.inventory import Inventory
+from app.clustering.clusters import Clustering
+from app.config import RunConfig
+from app.dense_job import DenseJob, write_dense_job
+from app.densify import Task, densify_inputs, densify_job, fuse_inputs, fuse_job, run_tasks
+from app.errors import CityReconError
+from app.executor import split_cores
+from app.log import ProgressLine
+from app.scene.read_model import read_posed_scene
+from app.stage import StageRecord, finished_product, run_stage
+from app.view_selection.selection import read_selections
+from app.workspace import Workspace, atomic_file, remove_tree
+from fusion.merge import merge_clouds
+from fusion.region import GroundRegion
+from mvs_backends import get_backend
+
+logger = logging.getLogger(__name__)
+
+
+def _write_jobs(
+    workspace: Workspace, folder: Path, jobs: Callable[[], Mapping[str, tuple[tuple[str, ...], GroundRegion]]]
+) -> dict[str, Path]:
+    """Write a job folder per name for given images and region.
+
+    Returns:
+        Job folder by name.
+    """
+
+    def work(partial: Path) -> None:
+        scene = read_posed_scene(workspace.georegistered_model)
+        cameras = pycolmap.Reconstruction(str(workspace.georegistered_model)).cameras
+        digests = {image.name: image.digest for image in Inventory.read(workspace.inventory_file).images}
+        row_of_name = {name: row for row, name in enumerate(scene.image_names)}
+        for name, (image_names, region) in jobs().items():
+            remove_tree(partial / name)
+            write_dense_job(
+                partial / name,
+                scene=scene,
+                image_rows=[row_of_name[image] for image in image_names],
+                region=region,
+                cameras=[cameras[camera_id] for camera_id in sorted(cameras)],
+                digests=digests,
+            )
+
+    run_stage(
+        folder,
+        options={},
+        inputs={
+            "selection": finished_product(workspace.root / "selection", "select"),
+            "clusters": finished_product(workspace.root / "clusters", "cluster"),
+            "model": finished_product(workspace.root / "georegister", "georegister"),
+            "images": finished_product(workspace.root / "capture", "capture"),
+        },
+        work=work,
+        product=lambda made: "",
+    )
+    return {path.name: path for path in sorted(folder.iterdir()) if path.is_dir()}
+
+
+def cluster_jobs(workspace: Workspace) -> dict[str, Path]:
+    """Write one job folder per cluster: its selected views, its cells."""
+
+    def jobs() -> dict[str, tuple[tuple[str, ...], GroundRegion]]:
+        clusters = Clustering.read(workspace.root / "clusters")
+        regions = {cluster.name: cluster.region() for cluster in clusters.clusters}
+        return {
+            selection.cluster: (selection.image_names, regions[selection.cluster])
+            for selection in read_selections(workspace.root / "selection")
+        }
+
+    return _write_jobs(workspace, workspace.root / "jobs", jobs)
+
+
+def batch_jobs(workspace: Workspace) -> dict[str, Path]:
+    """Write the one job of a batch reconstruction: all views, all cells."""
+
+    def jobs() -> dict[str, tuple[tuple[str, ...], GroundRegion]]:
+        regions = [cluster.region() for cluster in Clustering.read(workspace.root / "clusters").clusters]
+        region = GroundRegion(
+            cells=tuple(sorted({cell for region in regions for cell in region.cells})),
+            origin_m=regions[0].origin_m,
+            cell_size_m=regions[0].cell_size_m,
+            z_range_m=(min(r.z_range_m[0] for r in regions), max(r.z_range_m[1] for r in regions)),
+            padding_m=regions[0].padding_m,
+        )
+        return {"all": (read_posed_scene(workspace.georegistered_model).image_names, region)}
+
+    return _write_jobs(workspace, workspace.root / "batch" / "jobs", jobs)
+
+
+def densify_stage(
+    workspace: Workspace, config: RunConfig, *, jobs: Mapping[str, Path], folder: Path, num_jobs: int
+) -> dict[str, str]:
+    """Depth and normal maps of each job.
+
+    Returns:
+        Reason of failure by name of the jobs that failed.
+
+    Raises:
+        CityReconError: the back-end can't run here.
+    """
+    availability = get_backend(config.densify.backend).availability()
+    if not availability.ok:
+        raise CityReconError(f"back-end {config.densify.backend} can't run here: {availability.reason}")
+    inventory = Inventory.read(workspace.inventory_file)
+    num_workers, num_threads = split_cores(len(jobs), num_jobs)
+    tasks = {
+        name: Task(
+            folder=folder / name,
+            options={"densify": config.densify, "stereo": config.stereo},
+            inputs=densify_inputs(job),
+            arguments=(
+                job,
+                folder / name,
+                inventory.image_root,
+                inventory.mask_root,
+                config.densify,
+                config.stereo,
+                num_threads,
+            ),
+            num_steps=len(DenseJob.read(job).images),
+        )
+        for name, job in jobs.items()
+    }
+    _remove_strangers(folder, tasks)
+    return run_tasks("densify", densify_job, tasks, num_workers=num_workers, log_file=workspace.log_file)
+
+
+def fuse_stage(
+    workspace: Workspace,
+    config: RunConfig,
+    *,
+    jobs: Mapping[str, Path],
+    dense: Path,
+    folder: Path,
+    out: Path,
+    num_jobs: int,
+) -> dict[str, str]:
+    """A cloud of each job, cropped to its cells, and all of them in one file.
+
+    Returns:
+        Reason of failure by name of the jobs that failed or have no depth maps.
+
+    Raises:
+        CityReconError: no job left a point.
+    """
+    unfinished = {
+        name: "it has no depth maps; run `cityrecon densify` first" for name in jobs if StageRecord.read(dense / name) is None
+    }
+    tasks = {
+        name: Task(
+            folder=folder / name,
+            options=config.fusion,
+            inputs=fuse_inputs(dense / name),
+            arguments=(job, dense / name, folder / name, config.fusion),
+            num_steps=1,
+        )
+        for name, job in jobs.items()
+        if name not in unfinished
+    }
+    _remove_strangers(folder, tasks)
+    failures = run_tasks(
+        "fuse", fuse_job, tasks, num_workers=split_cores(len(tasks), num_jobs)[0], log_file=workspace.log_file
+    )
+    clouds = [folder / name / "cloud.ply" for name in sorted(tasks) if name not in failures]
+    filled = [cloud for cloud in clouds if cloud.exists()]
+    for cloud in clouds:
+        if not cloud.exists():
+            logger.warning("%s: empty, its views agreed on no point", cloud.parent.name)
+    if not filled:
+        raise CityReconError(f"no cluster left a point, {out} not written; see {workspace.log_file}")
+    with atomic_file(out) as partial:
+        num_points = merge_clouds(filled, partial, progress=ProgressLine("merge"))
+    logger.info("%s: %s points from %d of %d clusters", out, f"{num_points:,}", len(filled), len(jobs))
+    return unfinished | failures
+
+
+def _remove_strangers(folder: Path, tasks: Mapping[str, Task]) -> None:
+    """Remove what earlier options left: folders of clusters that are no more."""
+    if folder.exists():
+        for path in folder.iterdir():
+            if path.name.removesuffix(".partial") not in tasks:
+                remove_tree(path)

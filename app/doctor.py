@@ -1,0 +1,61 @@
+"""What is installed here, and what can run."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import platform
+import shutil
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from app.executor import available_cores
+from mvs_backends import BACKEND_NAMES, get_backend
+
+_PACKAGES = (
+    ("numpy", "numpy"),
+    ("numba", "numba"),
+    ("opencv-python-headless", "cv2"),
+    ("ortools", "ortools.sat.python.cp_model"),
+    ("pycolmap", "pycolmap"),
+    ("trimesh", "trimesh"),
+    ("open3d", "open3d"),
+)
+_OPEN3D_HELP = (
+    "only `compare` needs it; on Debian and Ubuntu: apt-get install libegl1 libgl1 libx11-6 libusb-1.0-0 libudev1 libidn2-0"
+)
+
+
+def diagnose() -> str:
+    """Describe this installation, one fact per line."""
+    memory_gib = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    lines = [
+        f"cityrecon {_version('cityrecon')}, Python {platform.python_version()}, {platform.platform()}",
+        f"{available_cores()} cores, {memory_gib:.0f} GiB memory, "
+        f"{shutil.disk_usage(Path.cwd()).free / 2**30:.0f} GiB free in {Path.cwd()}",
+        "",
+        "packages",
+    ]
+    for distribution, module in _PACKAGES:
+        lines.append(f"  {distribution:24}{_version(distribution):14}{_import_problem(module) or 'works'}")
+    lines += ["", "dense back-ends"]
+    for name in BACKEND_NAMES:
+        availability = get_backend(name).availability()
+        lines.append(f"  {name:24}{'yes' if availability.ok else 'no':14}{availability.reason}")
+    return "\n".join(lines)
+
+
+def _version(distribution: str) -> str:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return "missing"
+
+
+def _import_problem(module: str) -> str | None:
+    try:
+        importlib.import_module(module)
+    except (ImportError, OSError) as error:
+        problem = f"cannot be loaded: {error}"
+        return f"{problem}; {_OPEN3D_HELP}" if module == "open3d" else problem
+    return None

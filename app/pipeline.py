@@ -1,0 +1,156 @@
+"""The chain of `full`, from images to the cloud of the town, and its dense parts as commands of their own."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+from app.capture.inventory import Inventory
+from app.command_line import Run
+from app.comparison import compare_files
+from app.dense_job import DenseJob
+from app.dense_stages import batch_jobs, cluster_jobs, densify_stage, fuse_stage
+from app.errors import CityReconError, InputError
+from app.log import format_seconds
+from app.stages import (
+    CaptureSources,
+    capture_stage,
+    cluster_stage,
+    georegister_stage,
+    plan_stages,
+    select_stage,
+    sfm_stage,
+)
+from app.workspace import Workspace
+
+logger = logging.getLogger(__name__)
+
+
+def full_pipeline(
+    run: Run,
+    sources: CaptureSources,
+    *,
+    out: Path,
+    poses: Path | None,
+    model: Path | None,
+    compare_batch: bool,
+    allow_partial: bool,
+) -> None:
+    """Everything, from images to ``out``.
+
+    Raises:
+        CityReconError: a stage failed.
+    """
+    start = time.monotonic()
+    check_output(out)
+    logger.info("workspace: %s", run.workspace.root)
+    _announce(1, "capture: taking stock of the images")
+    capture_stage(run.workspace, sources, run.config)
+    _announce(2, "sfm: finding poses and sparse points")
+    sfm_stage(run.workspace, run.config, model=model, poses=poses)
+    _announce(3, "georegister: turning the model to z up and metres")
+    georegister_stage(run.workspace, run.config)
+    _announce(4, "cluster: cutting the town into clusters")
+    cluster_stage(run.workspace, run.config)
+    _announce(5, "select: choosing views")
+    select_stage(run.workspace, run.config, num_jobs=run.num_jobs)
+    _announce(6, "densify: estimating depth and normal maps")
+    densify_clusters(run, allow_partial=allow_partial)
+    _announce(7, "fuse: depth maps to one cloud")
+    fuse_clusters(run, out=out, allow_partial=allow_partial)
+    if compare_batch:
+        _announce(8, "batch: reconstructing the whole set at once, to compare")
+        batch = run.workspace.batch_cloud_file
+        batch_reconstruction(run, out=batch)
+        comparison = run.workspace.comparison_dir
+        comparison.mkdir(exist_ok=True)
+        text = compare_files(
+            out,
+            batch,
+            mesh=None,
+            json_file=comparison / "merged_against_batch.json",
+            picture=comparison / "merged_against_batch.png",
+            options=run.config.compare,
+        )
+        logger.info("%s\nfigures and picture in %s", text, comparison)
+    logger.info("done in %s", format_seconds(time.monotonic() - start))
+
+
+def _announce(number: int, text: str) -> None:
+    logger.info("[%d] %s", number, text)
+
+
+def check_output(out: Path) -> None:
+    """Refuse an output that can't be written, before hours of work.
+
+    Raises:
+        InputError: its folder doesn't exist or can't be written, or it is a folder.
+    """
+    if out.suffix.lower() != ".ply":
+        raise InputError(f"{out}: the output must end in .ply")
+    if out.is_dir():
+        raise InputError(f"{out} is a folder; name a file that ends in .ply")
+    if not out.parent.is_dir():
+        raise InputError(f"folder {out.parent} doesn't exist; create it or choose another output")
+    if not os.access(out.parent, os.W_OK):
+        raise InputError(f"folder {out.parent} can't be written; choose another output")
+
+
+def densify_clusters(run: Run, *, allow_partial: bool) -> None:
+    """Depth and normal maps of every cluster."""
+    jobs = cluster_jobs(run.workspace)
+    failures = densify_stage(
+        run.workspace, run.config, jobs=jobs, folder=run.workspace.root / "dense", num_jobs=run.num_jobs
+    )
+    _check(failures, len(jobs), allow_partial=allow_partial)
+
+
+def fuse_clusters(run: Run, *, out: Path, allow_partial: bool) -> None:
+    """One cloud of all clusters."""
+    jobs = cluster_jobs(run.workspace)
+    failures = fuse_stage(
+        run.workspace,
+        run.config,
+        jobs=jobs,
+        dense=run.workspace.root / "dense",
+        folder=run.workspace.root / "fused",
+        out=out,
+        num_jobs=run.num_jobs,
+    )
+    _check(failures, len(jobs), allow_partial=allow_partial)
+
+
+def batch_reconstruction(run: Run, *, out: Path) -> None:
+    """One cloud of the whole set at once."""
+    folder = run.workspace.root / "batch"
+    jobs = batch_jobs(run.workspace)
+    _check(
+        densify_stage(run.workspace, run.config, jobs=jobs, folder=folder / "dense", num_jobs=1), 1, allow_partial=False
+    )
+    failures = fuse_stage(
+        run.workspace,
+        run.config,
+        jobs=jobs,
+        dense=folder / "dense",
+        folder=folder / "fused",
+        out=out,
+        num_jobs=1,
+    )
+    _check(failures, 1, allow_partial=False)
+
+
+def _check(failures: Mapping[str, str], total: int, *, allow_partial: bool) -> None:
+    """Go on without the clusters that failed if that is allowed.
+
+    Raises:
+        CityReconError: some failed and that isn't allowed, or all failed.
+    """
+    if not failures:
+        return
+    name, reason = next(iter(failures.items()))
+    message = f"{len(failures)} of {total} clusters failed, first {name}: {reason}"
+    if not allow_partial or len(failures) == total:
+        raise CityReconError(f"{message}; run the same command again to retry them, or add --allow-partial")
+    logger.warning("%s; going on without them", message)

@@ -1,0 +1,179 @@
+"""The stages on a workspace: each finds its inputs there, does its work once, and leaves its products there."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pycolmap
+
+from app.capture.inventory import Inventory
+from app.config import RunConfig
+
+from app.densify import (
+    Task,
+    check_failures,
+    densify_inputs,
+    densify_job,
+    fuse_inputs,
+    fuse_job,
+    run_tasks,
+    write_failures,
+)
+from app.errors import CityReconError, InputError
+from app.executor import split_cores
+from app.log import ProgressLine
+from app.stage import StageRecord, digest, digest_files, finished_product, run_stage
+from app.workspace import Workspace, atomic_file
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureSources:
+    """Files and folders that the user names."""
+
+    images: Path
+    gps: Path | None = None
+    rig: Path | None = None
+    masks: Path | None = None
+    poses: Path | None = None
+
+
+def capture_stage(workspace: Workspace, sources: CaptureSources, config: RunConfig) -> str:
+    """Take stock of the images, or extract frames from videos."""
+    from app.capture.capture import capture
+    from app.capture.description import describe
+
+    def work(partial: Path) -> None:
+        capture(
+            sources.images,
+            partial,
+            options=config.capture,
+            gps_file=sources.gps,
+            pose_file=sources.poses,
+            rig_file=sources.rig,
+            mask_dir=sources.masks,
+            progress=ProgressLine("capture"),
+        )
+
+    product = run_stage(
+        workspace.root / "capture",
+        options=config.capture,
+        inputs={
+            name: _listing_digest(path)
+            for name, path in (
+                ("images", sources.images),
+                ("GPS file", sources.gps),
+                ("rig file", sources.rig),
+                ("masks", sources.masks),
+                ("poses", sources.poses),
+            )
+        },
+        work=work,
+        product=lambda folder: digest(replace(Inventory.read(folder / "inventory.json"), image_root=Path(), mask_root=None)),
+    )
+    logger.info("%s", describe(Inventory.read(workspace.inventory_file)))
+    return product
+
+
+def sfm_stage(workspace: Workspace, config: RunConfig, *, model: Path | None, poses: Path | None) -> str:
+    """Poses and sparse points: from the images, from an existing model, or from the images with known poses."""
+    from app.sfm.stage import import_model, run_sfm
+
+    inventory_product = finished_product(workspace.root / "capture", "capture")
+    inventory = Inventory.read(workspace.inventory_file)
+
+    def work(partial: Path) -> None:
+        if model is not None:
+            import_model(model, partial, inventory=inventory)
+        else:
+            run_sfm(inventory, partial, options=config.sfm, pose_file=poses, progress=ProgressLine("sfm"))
+
+    return run_stage(
+        workspace.root / "sfm",
+        options=config.sfm,
+        inputs={
+            "images": inventory_product,
+            "imported model": digest_files([model]) if model else "none",
+            "known poses": digest_files([poses]) if poses else "none",
+        },
+        work=work,
+        product=lambda folder: digest_files([folder / "model"]),
+    )
+
+
+def georegister_stage(workspace: Workspace, config: RunConfig) -> str:
+    """Turn the model to z up, in metres, in ENU where GPS is known."""
+    from app.georegister.stage import georegister
+
+    model_product = finished_product(workspace.root / "sfm", "sfm")
+    inventory_product = finished_product(workspace.root / "capture", "capture")
+    return run_stage(
+        workspace.root / "georegister",
+        options=config.georegister,
+        inputs={"model": model_product, "images": inventory_product},
+        work=lambda partial: georegister(
+            workspace.sfm_model, Inventory.read(workspace.inventory_file), partial, options=config.georegister
+        ),
+        product=lambda folder: digest_files([folder]),
+    )
+
+
+def cluster_stage(workspace: Workspace, config: RunConfig) -> str:
+    """Cut the model into overlapping ground clusters ([O] section 3)."""
+    from app.clustering.stage import cluster
+
+    model_product = finished_product(workspace.root / "georegister", "georegister")
+    georeference = Georeference.read(workspace.georeference_file)
+    return run_stage(
+        workspace.root / "clusters",
+        options=config.clustering,
+        inputs={"model": model_product},
+        work=lambda partial: cluster(
+            workspace.georegistered_model,
+            partial,
+            options=config.clustering,
+            units_per_m=georeference.units_per_m,
+        ),
+        product=lambda folder: digest_files([folder / "clusters.jsonl"]),
+    )
+
+
+def select_stage(workspace: Workspace, config: RunConfig, *, num_jobs: int) -> str:
+    """Choose the smallest set of views of each cluster that still sees and matches everything ([O] section 4)."""
+    from app.view_selection.stage import select
+
+    clusters_product = finished_product(workspace.root / "clusters", "cluster")
+    return run_stage(
+        workspace.root / "selection",
+        options=config.selection,
+        inputs={"clusters": clusters_product},
+        work=lambda partial: select(
+            workspace.georegistered_model,
+            workspace.root / "clusters",
+            partial,
+            options=config.selection,
+            num_workers=split_cores(available_cores(), num_jobs)[0],
+            progress=ProgressLine("select"),
+        ),
+        product=lambda folder: digest_files([folder / "selection.jsonl"]),
+    )
+def _listing_digest(path: Path | None) -> str:
+    """Hash of the names, sizes and times of a file or of all files in a folder: cheap, and a false alarm costs little."""
+    if path is None:
+        return "none"
+    files = [path]
+    if path.is_dir():
+        files = [Path(folder) / name for folder, _, names in os.walk(path) for name in names]
+    states = []
+    for file in sorted(files):
+        try:
+            state = file.stat()
+        except OSError:
+            continue
+        states.append((os.fsencode(file).hex(), state.st_size, state.st_mtime_ns))
+    return digest(str(path.resolve()), states)

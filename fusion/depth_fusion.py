@@ -1,0 +1,66 @@
+"""Depth and normal maps of one COLMAP dense workspace -> one coloured cloud with normals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from fusion.cloud import PointCloud, read_ply
+from fusion.errors import FusionError
+
+
+@dataclass(frozen=True, kw_only=True)
+class FusionOptions:
+    """When depth maps of several views agree on a point; names as in COLMAP's stereo fusion."""
+
+    min_num_pixels: int = 3
+    """Views that must agree on a point."""
+    max_reproj_error_px: float = 2.0
+    """Largest distance between a pixel and the reprojection of its neighbour view's point."""
+    max_depth_error: float = 0.01
+    """Largest relative difference of depths."""
+    max_normal_error_deg: float = 15.0
+    """Largest angle between normals."""
+
+    def __post_init__(self) -> None:
+        if self.min_num_pixels < 1:
+            raise ValueError(f"min_num_pixels must be at least 1, not {self.min_num_pixels}")
+        for name in ("max_reproj_error_px", "max_depth_error", "max_normal_error_deg"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be greater than 0, not {getattr(self, name)}")
+
+
+def fuse_depth_maps(
+    workspace: Path, output: Path, *, options: FusionOptions, bounds: NDArray[np.float64]
+) -> PointCloud:
+    """Fuse all depth maps of a workspace by COLMAP's stereo fusion (Schoenberger et al. 2016, section 4.6).
+
+    One thread: with more, COLMAP's order of points depends on timing.
+
+    Args:
+        workspace: COLMAP dense workspace with `stereo/fusion.cfg` and `geometric` maps.
+        output: scratch PLY file.
+        options: agreement of views.
+        bounds: (2, 3) minimum and maximum corner of the region of interest, world frame.
+
+    Raises:
+        FusionError: the maps are missing or unreadable.
+    """
+    fusion = pycolmap.StereoFusionOptions()
+    fusion.num_threads = 1
+    fusion.min_num_pixels = options.min_num_pixels
+    fusion.max_reproj_error = options.max_reproj_error_px
+    fusion.max_depth_error = options.max_depth_error
+    fusion.max_normal_error = options.max_normal_error_deg
+    fusion.bounding_box = (bounds[0], bounds[1])
+    try:
+        pycolmap.stereo_fusion(
+            str(output), str(workspace), input_type="geometric", options=fusion, output_type="PLY"
+        )
+    except (ValueError, RuntimeError) as error:
+        raise FusionError(f"{workspace}: stereo fusion failed: {error}") from error
+    return read_ply(output)
