@@ -16,8 +16,9 @@ def write_submodel(
 ) -> None:
     """Write chosen images and points as a binary COLMAP model with undistorted (PINHOLE) cameras.
 
-    Images, cameras and points keep their IDs; each camera is a rig of its own and each image a frame of its own. The 2D points of an image are the projections of the points that its tracks say it sees;
-    observations in other images or behind the camera are left out, and points without any observation too.
+    Images, cameras and points keep their IDs; each camera is a rig of its own and each image a frame of its own. The
+    2D points of an image are the projections of the points that its tracks say it sees; observations in other images
+    or behind the camera are left out, and points without any observation too.
 
     Args:
         scene: What to take from.

@@ -1,0 +1,91 @@
+"""Compiled loops of clustering."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from app.scene.kernels import sees
+
+
+@njit(cache=True)
+def _box_is_outside(
+    image_from_world: NDArray[np.float64],
+    size_px: NDArray[np.float64],
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+) -> bool:
+    """Whether one side of the viewing frustum has the whole box on its outer side."""
+    for side in range(5):
+        bound = 0.0
+        for column in range(4):
+            z = image_from_world[2, column]
+            if side == 0:
+                coefficient = z
+            elif side == 1:
+                coefficient = image_from_world[0, column]
+            elif side == 2:
+                coefficient = size_px[0] * z - image_from_world[0, column]
+            elif side == 3:
+                coefficient = image_from_world[1, column]
+            else:
+                coefficient = size_px[1] * z - image_from_world[1, column]
+            if column == 3:
+                bound += coefficient
+            else:
+                bound += max(coefficient * low[column], coefficient * high[column])
+        # The slack keeps rounding from throwing out what a sample on the box's border would show.
+        if bound < -1e-6:
+            return True
+    return False
+
+
+@njit(cache=True)
+def cameras_with_a_view(
+    keypoints: NDArray[np.float64],
+    axis_x: NDArray[np.float64],
+    axis_y: NDArray[np.float64],
+    axis_z: NDArray[np.float64],
+    image_from_world: NDArray[np.float64],
+    sizes_px: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Which images have at least one keypoint or sample in front of them and inside their rectangle.
+
+    Args:
+        keypoints: (n, 3) in the world.
+        axis_x: Coordinates of the samples along x; the samples are all combinations of the three axes.
+        axis_y: The same along y.
+        axis_z: The same along z.
+        image_from_world: (m, 3, 4) K [R | t].
+        sizes_px: (m, 2) width, height.
+
+    Returns:
+        (m,)
+    """
+    out = np.zeros(len(image_from_world), np.bool_)
+    low = np.array([axis_x[0], axis_y[0], axis_z[0]])
+    high = np.array([axis_x[-1], axis_y[-1], axis_z[-1]])
+    sample = np.empty(3)
+    for camera in range(len(image_from_world)):
+        matrix, size_px = image_from_world[camera], sizes_px[camera]
+        for row in range(len(keypoints)):
+            if sees(matrix, size_px, keypoints[row]):
+                out[camera] = True
+                break
+        if out[camera] or _box_is_outside(matrix, size_px, low, high):
+            continue
+        for x in axis_x:
+            sample[0] = x
+            for y in axis_y:
+                sample[1] = y
+                for z in axis_z:
+                    sample[2] = z
+                    if sees(matrix, size_px, sample):
+                        out[camera] = True
+                        break
+                if out[camera]:
+                    break
+            if out[camera]:
+                break
+    return out

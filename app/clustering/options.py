@@ -1,0 +1,74 @@
+"""Options of view clustering."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClusteringOptions:
+    """How the ground is cut into blocks and which images belong to each, [O] section 3.
+
+    Lengths are metres; for a model without a known scale they are multiplied by its units per metre.
+    """
+
+    block_size_m: tuple[float, float] = (20.0, 20.0)
+    """Block size (x_b, y_b); [O] section 4.1."""
+    overlap_m: float = 2.0
+    """How far a block's padded bounds reach over its border, d_overlap; [O] section 4.1."""
+    sample_spacing_m: float = 1.0
+    """Spacing r of the uniform samples in a block; [O] section 4.1."""
+    min_keypoints_per_block: int = 5
+    """Blocks with fewer keypoints are dropped; stray points come in ones and twos. [O] drops empty blocks only."""
+    max_camera_distance_m: float = 40.0
+    """Images taken farther than this from a block's centre, on the ground, don't join it.
+
+    [O] gives no number. The depth error grows with the distance squared: at 40 m, with a focal length of 1,500 px, a
+    baseline of 2 m and matches good to half a pixel, it is 0.27 m. Also, what is farther away in a street is mostly
+    hidden behind houses.
+    """
+    min_cameras_per_cluster: int = 10
+    """Clusters with fewer images are merged into a neighbour; [O] section 3."""
+    height_quantiles: tuple[float, float] = (0.01, 0.99)
+    """Heights between these quantiles of the keypoints in a block and its neighbours count as its range of heights."""
+    height_margin_m: float = 1.0
+    """Added to the range of heights at both ends."""
+    camera_height_m: float = 2.5
+    """The range of heights reaches at least this far below the median camera in the block and beside it, so that a road
+    without any keypoint is part of it."""
+
+    def __post_init__(self) -> None:
+        if not all(0 < size < math.inf for size in self.block_size_m):
+            raise ValueError(f"block_size_m must be two positive lengths, not {self.block_size_m}")
+        if not 0 <= self.overlap_m < min(self.block_size_m):
+            raise ValueError(f"overlap_m must be at least 0 and less than the block size, not {self.overlap_m}")
+        if not 0 < self.sample_spacing_m <= min(self.block_size_m):
+            raise ValueError(f"sample_spacing_m must be positive and fit in a block, not {self.sample_spacing_m}")
+        if self.min_keypoints_per_block < 1:
+            raise ValueError(f"min_keypoints_per_block must be at least 1, not {self.min_keypoints_per_block}")
+        if not 0 < self.max_camera_distance_m < math.inf:
+            raise ValueError(f"max_camera_distance_m must be positive, not {self.max_camera_distance_m}")
+        if self.min_cameras_per_cluster < 1:
+            raise ValueError(f"min_cameras_per_cluster must be at least 1, not {self.min_cameras_per_cluster}")
+        low, high = self.height_quantiles
+        if not 0 <= low < high <= 1:
+            raise ValueError(f"height_quantiles must ascend from 0 to 1, not {self.height_quantiles}")
+        if not 0 <= self.height_margin_m < math.inf:
+            raise ValueError(f"height_margin_m must be at least 0, not {self.height_margin_m}")
+        if not 0 <= self.camera_height_m < math.inf:
+            raise ValueError(f"camera_height_m must be at least 0, not {self.camera_height_m}")
+
+    def in_model_units(self, units_per_m: float) -> ClusteringOptions:
+        """These options with all lengths in the model's units."""
+        if not 0 < units_per_m < math.inf:
+            raise ValueError(f"units_per_m must be positive, not {units_per_m}")
+        return replace(
+            self,
+            block_size_m=(self.block_size_m[0] * units_per_m, self.block_size_m[1] * units_per_m),
+            overlap_m=self.overlap_m * units_per_m,
+            sample_spacing_m=self.sample_spacing_m * units_per_m,
+            max_camera_distance_m=self.max_camera_distance_m * units_per_m,
+            height_margin_m=self.height_margin_m * units_per_m,
+            camera_height_m=self.camera_height_m * units_per_m,
+        )
