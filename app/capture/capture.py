@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -16,6 +15,7 @@ from app.capture.gps import assign_gps, mean_position, read_gps_file
 from app.capture.image_check import ImageProbe, check_images, png_size
 from app.capture.inventory import CameraEntry, FrameEntry, ImageEntry, Inventory
 from app.capture.poses import match_poses, read_pose_file
+from app.capture.rig import check_prefixes, read_rig_file
 from app.capture.scan import VIDEO_SUFFIXES, Listing, camera_of, check_stems, natural_key, scan, stem_of
 from app.capture.video import Sampling, extract_frames, frame_rate_of, times_along_path
 from app.errors import InputError
@@ -130,6 +130,8 @@ def capture(
         zip(names, check_images(root, names, num_threads=options.num_threads, progress=progress), strict=True)
     )
     cameras = _cameras(source, root, probes)
+    if rig_file is not None:
+        check_prefixes(rig_file, read_rig_file(rig_file), names)
     is_rig = _is_rig([camera.name for camera in cameras], names, options.rig, rig_file)
     frames = _frames(probes, is_rig, times_s)
     frames = _with_positions(frames, probes, gps_file, pose_file)
@@ -145,7 +147,7 @@ def capture(
             for name in sorted(names)
         ),
         is_rig=is_rig,
-        rig_file=_checked_rig_file(rig_file, names) if rig_file else None,
+        rig_file=rig_file.resolve() if rig_file else None,
         mask_root=mask_dir.resolve() if mask_dir else None,
         video_frame_interval_s=interval_s,
     )
@@ -313,19 +315,3 @@ def _check_masks(mask_dir: Path, probes: Mapping[str, ImageProbe]) -> set[str]:
     if len(found) < len(probes):
         logger.warning("%d of %d images have no mask in %s", len(probes) - len(found), len(probes), mask_dir)
     return found
-
-
-def _checked_rig_file(rig_file: Path, names: Sequence[str]) -> Path:
-    """The resolved path of a rig file whose image prefixes all have images.
-
-    pycolmap's own reader ends the whole process on some malformed files, so the file is checked here first.
-    """
-    path = _existing(rig_file, "rig file")
-    try:
-        prefixes = [camera["image_prefix"] for rig in json.loads(path.read_bytes()) for camera in rig["cameras"]]
-        unused = [prefix for prefix in prefixes if not any(name.startswith(prefix) for name in names)]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{rig_file} is not a rig configuration of COLMAP ({error!r}); see rig_config.json") from error
-    if unused:
-        raise InputError(f"{rig_file}: no image name starts with its image_prefix {unused[0]!r}; correct the prefix")
-    return path
