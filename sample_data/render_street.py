@@ -209,8 +209,8 @@ def render_street(
     Args:
         folder: Created if need be.
         options: What to render.
-        with_depth: Also write ``depth/cam0/000000.npy`` ..., float32 (H, W): depth along the camera's z in metres at the
-            pixel centres, 0 where there is only sky.
+        with_depth: Also write ``depth/cam0/000000.npy`` ..., float32 (H, W): depth along the camera's z in metres at
+            the pixel centres, 0 where there is only sky.
         with_cloud: Also write gt.ply and gt_mesh.ply.
 
     Returns:

@@ -94,7 +94,7 @@ def rig_cameras(n_cameras: int) -> list[Pose]:
 
 def rig_poses(town: Town, n_frames: int, spacing_m: float, height_m: float, seed: int) -> list[Pose]:
     """Poses ``rig_from_world`` of all frames: along the path, with the slight sway of a car on its springs."""
-    xy, headings = town.plan.path.at(np.arange(n_frames) * spacing_m)
+    xy, headings = town.plan.path.at(spacing_m * np.arange(n_frames, dtype=np.float64))
     phase = np.random.default_rng([seed, 1]).uniform(0, 2 * math.pi, 3)
     poses = []
     for index in range(n_frames):
@@ -123,18 +123,20 @@ class TownRenderer:
         self._o3d = o3d
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=0)
         vertices, triangles = town.mesh.welded()
-        self._scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(triangles.astype(np.uint32)))
+        self._scene.add_triangles(
+            o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(triangles.astype(np.uint32))
+        )
 
     def cast(self, pose: Pose, rays: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
         """First hits of rays (N, 3), given in the camera with z = 1.
 
         Returns:
-            Arrays ``depth`` (N,) in metres along z, infinite where there is only sky; ``triangle`` (N,) and ``uv`` (N, 2)
+            Arrays ``depth`` (N,) in metres along z, infinite where there is only sky; ``triangle`` (N,); ``uv`` (N, 2)
             barycentric; ``normal`` (N, 3) towards the camera; ``direction`` (N, 3) in the world.
         """
         direction = rays @ pose.rotation.astype(np.float32)
         origin = np.broadcast_to(pose.center.astype(np.float32), direction.shape)
-        hits = self._scene.cast_rays(self._o3d.core.Tensor(np.concatenate([origin, direction], axis=1)))
+        hits = self._scene.cast_rays(self._o3d.core.Tensor.from_numpy(np.concatenate([origin, direction], axis=1)))
         normal = hits["primitive_normals"].numpy()
         facing = np.einsum("ij,ij->i", normal, direction)
         return {
@@ -200,7 +202,7 @@ class TownRenderer:
         lit = np.flatnonzero(facing > 0)
         starts = xyz[lit] + _SHADOW_OFFSET_M * (1 + 0.1 * depth[lit, None]) * normal[lit]
         shadow_rays = np.concatenate([starts, np.broadcast_to(sun, starts.shape)], axis=1)
-        blocked = self._scene.test_occlusions(self._o3d.core.Tensor(shadow_rays)).numpy()
+        blocked = self._scene.test_occlusions(self._o3d.core.Tensor.from_numpy(shadow_rays)).numpy()
         facing[lit[blocked]] = 0.0
         ambient = _AMBIENT_LIGHT * (0.8 + 0.2 * normal[:, 2])
         light = ambient[:, None] * np.array([0.95, 1.0, 1.08]) + _SUN_LIGHT * facing[:, None] * np.array(

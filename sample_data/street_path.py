@@ -124,8 +124,8 @@ def _open_plan(pieces: list[tuple[float, float]]) -> RoadPlan:
 def _roundabout_plan(length_m: float) -> RoadPlan:
     """Approach from the west, around the island, and out to the north (the third exit).
 
-    The approach is a line at the lane's offset beside the axis through the island's centre; an arc to the right of radius r
-    leads onto the ring of radius R. Both are tangent where cos(turn) = (r + offset) / (R + r).
+    The approach is a line at the lane's offset beside the axis through the island's centre; an arc to the right of
+    radius r leads onto the ring of radius R. Both are tangent where cos(turn) = (r + offset) / (R + r).
     """
     ring_m, entry_m, ring_half_width_m = 11.0, 10.0, 4.6
     turn = math.acos((entry_m + LANE_OFFSET_M) / (ring_m + entry_m))

@@ -77,7 +77,8 @@ def noise_pyramid(seed: int) -> tuple[Floats, ...]:
     level = np.stack([np.clip(detail / 2.2, -1, 1), spots, np.clip(stains / 2.2, -1, 1)], axis=2).astype(np.float32)
     levels = [level]
     for _ in range(_LEVELS - 1):
-        levels.append(cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+        half = cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        levels.append(np.asarray(half, dtype=np.float32))
     return tuple(levels)
 
 
@@ -203,7 +204,7 @@ def _ground(xyz: Floats, noise: Floats, coarse: Floats, footprint: Floats, field
     is_grass = edge >= SIDEWALK_M
     green = 0.38 * (1 + 1.6 * grain)
     albedo[is_grass] = green[is_grass, None] * np.array([0.85, 1.0, 0.5], dtype=np.float32)
-    return albedo
+    return np.asarray(albedo, dtype=np.float32)
 
 
 def _built(kind: Kind, uv: Floats, noise: Floats, coarse: Floats, contrast: Floats, footprint: Floats) -> Floats:
