@@ -55,8 +55,8 @@ class CaptureOptions:
     def __post_init__(self) -> None:
         if not 0.0 < self.video_interval_s < float("inf"):
             raise ValueError(f"video_interval_s must be above 0, not {self.video_interval_s}")
-        if self.video_spacing_m is not None and not 0.0 < self.video_spacing_m < float("inf"):
-            raise ValueError(f"video_spacing_m must be above 0, not {self.video_spacing_m}")
+        if self.video_spacing_m is not None and not 0.01 <= self.video_spacing_m < float("inf"):
+            raise ValueError(f"video_spacing_m must be at least 0.01, not {self.video_spacing_m}")
         if not 0.0 <= self.video_min_displacement < 1.0:
             raise ValueError(
                 f"video_min_displacement must be at least 0 and below 1, not {self.video_min_displacement}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from cv2.typing import MatLike
+from numpy.typing import NDArray
 
 from app.capture.gps import GpsTable
 from app.errors import CityReconError, InputError
@@ -129,19 +131,18 @@ def times_along_path(table: GpsTable, spacing_m: float, frame_rate: float) -> tu
     lat, lon = np.radians(positions[:, 0]), np.unwrap(np.radians(positions[:, 1]))
     east_m = (lon - lon[0]) * np.cos(lat) * _EARTH_RADIUS_M
     north_m = (lat - lat[0]) * _EARTH_RADIUS_M
-    # Consecutive fixes of a standing receiver wander: a step counts from the last fix that is a whole spacing away.
+    track = np.column_stack((east_m, north_m))
     wanted = [float(times[0])]
-    last = np.array([east_m[0], north_m[0]])
-    last_time = float(times[0])
+    last = track[0]
     for row in range(1, len(times)):
-        here = np.array([east_m[row], north_m[row]])
-        distance = float(np.linalg.norm(here - last))
-        steps = int(distance / spacing_m)
-        if steps:
-            fractions = np.arange(1, steps + 1) * (spacing_m / distance)
-            wanted.extend((last_time + fractions * (float(times[row]) - last_time)).tolist())
-            last = last + fractions[-1] * (here - last)
-            last_time = wanted[-1]
+        start, step = track[row - 1], track[row] - track[row - 1]
+        # Distance from the last wanted point, not along the track, which the wandering fixes of a standing receiver
+        # make long.
+        done = 0.0
+        while np.linalg.norm(track[row] - last) >= spacing_m:
+            done = max(_crossing(start - last, step, spacing_m), done)
+            last = start + done * step
+            wanted.append(float(times[row - 1] + done * (times[row] - times[row - 1])))
     return tuple(wanted)
 
 
@@ -227,6 +228,12 @@ class _MotionGate:
         self._kept = self._latest
         if self._kept is not None:
             self._kept_corners = cv2.goodFeaturesToTrack(self._kept, _MAX_FEATURES, 0.01, 5)
+
+
+def _crossing(start: NDArray[np.float64], step: NDArray[np.float64], radius: float) -> float:
+    """Share of ``step`` after which a point from ``start`` on leaves the circle about the origin."""
+    a, b, c = float(step @ step), float(start @ step), float(start @ start) - radius**2
+    return min(max((-b + math.sqrt(max(b * b - a * c, 0.0))) / a, 0.0), 1.0)
 
 
 def _sample_times(sampling: Sampling) -> Iterator[float]:
