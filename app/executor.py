@@ -105,7 +105,7 @@ def run_jobs(
 
 
 def _run_job(function: Job, arguments: tuple[Any, ...], pipe: Connection, log_file: Path, parent: int) -> None:
-    _die_with_parent(parent)
+    die_with_parent(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with log_file.open("ab") as handle:
         # Native libraries write to the descriptors, also when they abort the process.
@@ -127,7 +127,7 @@ def _how_it_ended(exit_code: int | None) -> str:
     return f"its process ended with exit code {exit_code}"
 
 
-def _die_with_parent(parent: int) -> None:
+def die_with_parent(parent: int) -> None:
     """Ask Linux to kill this process when its parent ends, so that a killed run leaves nobody behind."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG

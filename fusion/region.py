@@ -33,7 +33,7 @@ class GroundRegion:
     """Corner of cell (0, 0)."""
     cell_size_m: tuple[float, float]
     z_range_m: tuple[float, float]
-    """Robust range of heights of what is to be reconstructed. Bounds the search for depth; no cloud is cropped by it."""
+    """Robust heights of what is to be reconstructed. It bounds the search for depth; clouds aren't cropped by it."""
     padding_m: float
     """Overlap d_overlap of [O] section 3: how far the padded region reaches over each cell's border, also in z."""
 

@@ -63,7 +63,10 @@ def associate(scene: PosedScene, options: ClusteringOptions) -> Blocks:
     size = np.array(options.block_size_m)
     origin = np.floor(low / size) * size
     grid = GroundGrid(
-        origin_m=(float(origin[0]), float(origin[1])), block_size_m=options.block_size_m, overlap_m=options.overlap_m
+        origin_m=(float(origin[0]), float(origin[1])),
+        block_size_m=options.block_size_m,
+        overlap_m=options.overlap_m,
+        sample_spacing_m=options.sample_spacing_m,
     )
     if len(keypoints) == 0:
         return Blocks(grid=grid, kept=[], dropped=[], num_far_keypoints=num_far)

@@ -85,6 +85,7 @@ class Clustering:
                     origin_m=tuple(header["grid"]["origin_m"]),
                     block_size_m=tuple(header["grid"]["block_size_m"]),
                     overlap_m=header["grid"]["overlap_m"],
+                    sample_spacing_m=header["grid"]["sample_spacing_m"],
                 )
                 return cls(
                     grid=grid,

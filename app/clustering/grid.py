@@ -19,6 +19,9 @@ class GroundGrid:
     origin_m: tuple[float, float]
     block_size_m: tuple[float, float]
     overlap_m: float
+    """d_overlap: how far a cell's padded bounds reach over its border."""
+    sample_spacing_m: float
+    """r: distance of the uniform samples in the cells."""
 
     def cells_of(self, positions: NDArray[np.float64]) -> NDArray[np.int64]:
         """(n, 2) cells of finite positions, (n, 2) or (n, 3)."""

@@ -1,0 +1,67 @@
+"""Options of view selection."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class SelectionMethod(StrEnum):
+    """How the views of a cluster are chosen."""
+
+    PAPER = "paper"
+    """As [O] section 4 says: the N_min best-seeing views are forced, then as few more as the constraints need."""
+    OPTIMAL = "optimal"
+    """Among all smallest sets that meet the constraints, the one with the best total view quality."""
+
+
+class Visibility(StrEnum):
+    """Which images count as seeing a keypoint. Samples are always seen by the images that they project into."""
+
+    FRUSTUM = "frustum"
+    """Those that it projects into."""
+    TRACKS = "tracks"
+    """Those in its track. Few images of a video observe the same keypoint, so nearly all of them become necessary."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelectionOptions:
+    """What a selection of views must provide, [O] section 4."""
+
+    method: SelectionMethod = SelectionMethod.OPTIMAL
+    """`paper` or `optimal`."""
+    visibility: Visibility = Visibility.FRUSTUM
+    """`frustum` or `tracks`: which images count as seeing a keypoint."""
+    n_vis: int = 2
+    """Views that must see each point, N_vis; [O] section 4.1."""
+    n_match: int = 2
+    """Selected views that each selected view must match with, N_match; [O] section 4.1."""
+    n_low: int = 10
+    """Lower bound of N_min, N_low; [O] section 4.1."""
+    n_high: int = 30
+    """Upper bound of N_min, N_high; [O] section 4.1."""
+    min_views_fraction: float = 0.5
+    """N_min is this share of a cluster's views, f(N_c) = N_c / 2, clamped between N_low and N_high. [O] says only that
+    it adapts; its clusters have 174 to 195 views on average and keep 31 to 34, so nearly all must reach N_high = 30.
+    Where images are sparse, stereo needs most of the overlap that they have."""
+    min_shared_points: int = 20
+    """Two views match when they see at least this many common points (keypoints and samples)."""
+    max_solver_time_s: float = 10.0
+    """Time limit of each solver call. It counts the solver's deterministic time, which is close to seconds but the same
+    on every machine."""
+
+    def __post_init__(self) -> None:
+        for name in ("n_vis", "n_match", "n_low", "min_shared_points"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if self.n_high < self.n_low:
+            raise ValueError(f"n_high must be at least n_low ({self.n_low}), not {self.n_high}")
+        if not 0 <= self.min_views_fraction <= 1:
+            raise ValueError(f"min_views_fraction must be between 0 and 1, not {self.min_views_fraction}")
+        if not 0 < self.max_solver_time_s < math.inf:
+            raise ValueError(f"max_solver_time_s must be positive, not {self.max_solver_time_s}")
+
+    def min_views(self, num_views: int) -> int:
+        """N_min for a cluster of ``num_views``, before it is limited by the views there are."""
+        return min(max(math.ceil(self.min_views_fraction * num_views), self.n_low), self.n_high)
