@@ -32,6 +32,7 @@ import typer
 from numpy.typing import NDArray
 
 from fusion.cloud import PointCloud, write_ply
+from fusion.thinning import thin
 from sample_data.street_camera import Camera, Pose, TownRenderer, rig_cameras, rig_poses
 from sample_data.street_path import PathKind
 from sample_data.street_scene import Town, build_town
@@ -110,17 +111,10 @@ class StreetTruth:
             in_camera = (depth[..., None] * rays)[near].astype(np.float64)
             world = (in_camera - pose.translation) @ pose.rotation
             cloud = PointCloud(world.astype(np.float32), normals[near].astype(np.float32))
-            parts.append(_first_per_voxel(cloud, self.options.truth_voxel_m))
+            parts.append(thin(cloud, self.options.truth_voxel_m))
             if len(parts) > 8:
-                parts = [_first_per_voxel(PointCloud.concatenate(parts), self.options.truth_voxel_m)]
-        return _first_per_voxel(PointCloud.concatenate(parts), self.options.truth_voxel_m)
-
-
-def _first_per_voxel(cloud: PointCloud, voxel_m: float) -> PointCloud:
-    """Keep the first point of each voxel, in the order of the points."""
-    index = np.floor(cloud.points.astype(np.float64) / voxel_m).astype(np.int64) + (1 << 20)
-    key = (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
-    return cloud.select(np.sort(np.unique(key, return_index=True)[1]))
+                parts = [thin(PointCloud.concatenate(parts), self.options.truth_voxel_m)]
+        return thin(PointCloud.concatenate(parts), self.options.truth_voxel_m)
 
 
 def build_street(options: StreetOptions) -> StreetTruth:
