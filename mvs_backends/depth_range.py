@@ -1,0 +1,46 @@
+"""The part of each pixel's ray that lies in the region of interest."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvs_backends.base import MvsView
+
+
+def depth_range(
+    view: MvsView, boxes_in_world: NDArray[np.float64], width: int, height: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Depths at which each pixel's ray enters and leaves the region.
+
+    Args:
+        view: the camera.
+        boxes_in_world: (B, 2, 3) minimum and maximum corners; the region is their union.
+        width: columns of the result, which may be a reduced image of the view.
+        height: rows of the result.
+
+    Returns:
+        Two (height, width) arrays of camera z, entry and exit, both 0 where the ray misses all boxes. Where it passes
+        several boxes they are the first entry and the last exit. The entry is 0 for a camera inside a box.
+    """
+    columns = (np.arange(width) + 0.5) * (view.width / width)
+    rows = (np.arange(height) + 0.5) * (view.height / height)
+    pixels = np.stack([*np.meshgrid(columns, rows), np.ones((height, width))], axis=-1)
+    rotation, translation = view.cam_from_world[:, :3], view.cam_from_world[:, 3]
+    # Scaled so that the ray parameter is camera z.
+    rays = pixels @ (np.linalg.inv(view.calibration).T @ rotation)
+    center = -rotation.T @ translation
+    entry = np.full((height, width), np.inf)
+    leave = np.zeros((height, width))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1.0 / rays
+        for low, high in boxes_in_world:
+            first, second = (low - center) * inverse, (high - center) * inverse
+            # A ray within a slab's face gives 0 * inf = NaN there, which fmin and fmax pass over.
+            near = np.fmax.reduce(np.fmin(first, second), axis=-1).clip(min=0.0)
+            far = np.fmin.reduce(np.fmax(first, second), axis=-1)
+            hit = far > near
+            entry = np.where(hit, np.minimum(entry, near), entry)
+            leave = np.where(hit, np.maximum(leave, far), leave)
+    entry[leave <= 0] = 0.0
+    return entry, leave

@@ -1,0 +1,237 @@
+"""The embedded CPU back-end: schedule of passes over the views of a cluster, kept work, and the maps at the end."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import shutil
+import time
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import asdict
+from pathlib import Path
+from typing import ClassVar
+
+import cv2
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from mvs_backends.base import Availability, MvsBackend, MvsError, MvsJob, MvsOptions, Progress
+from mvs_backends.patchmatch.geometry import depth_and_normal, level_camera
+from mvs_backends.patchmatch.images import ImageCache
+from mvs_backends.patchmatch.kernels import PADDING, Reference
+from mvs_backends.patchmatch.options import PatchMatchOptions, options_of_preset
+from mvs_backends.patchmatch.prior import interpolated_planes
+from mvs_backends.patchmatch.search import (
+    Hypotheses,
+    LevelSearch,
+    gather_sources,
+    inverse_range,
+    sparse_points_in_image,
+    upsampled,
+    window,
+)
+
+logger = logging.getLogger(__name__)
+
+
+class PatchMatch(MvsBackend):
+    """PatchMatch stereo on the CPU after ACMP (Xu & Tao 2020) and ACMM (2019), bounded by the cluster's region."""
+
+    name: ClassVar[str] = "patchmatch"
+
+    def availability(self) -> Availability:
+        """Always: it needs nothing but this package."""
+        return Availability(ok=True, reason="built in, runs on the CPU")
+
+    def estimate(self, *, job: MvsJob, options: MvsOptions, num_threads: int, progress: Progress | None = None) -> None:
+        """See `MvsBackend.estimate`."""
+        estimate_maps(
+            job=job,
+            options=options_of_preset(options),
+            seed=options.seed,
+            num_threads=num_threads,
+            progress=progress,
+        )
+
+
+def estimate_maps(
+    *, job: MvsJob, options: PatchMatchOptions, seed: int, num_threads: int, progress: Progress | None = None
+) -> None:
+    """Depth and normal maps of all reference views of a job.
+
+    Every pass runs over all views before the next one begins, since a geometric pass compares a view with its source
+    views' maps of the pass before. What a pass found for a view is kept in `stereo/patchmatch/` until all is done.
+
+    Raises:
+        MvsError: an image or mask can't be read.
+    """
+    if all(job.depth_map_path(v).exists() and job.normal_map_path(v).exists() for v in range(len(job.views))):
+        return
+    num_levels = len(options.iterations)
+    total = num_levels * len(job.views)
+    folder = _kept_folder(job, options, seed)
+    with ThreadPoolExecutor(num_threads) as executor:
+        images = ImageCache(job)
+        for number in range(num_levels):
+            for view in range(len(job.views)):
+                last = number == num_levels - 1
+                done = (
+                    job.depth_map_path(view).exists() and job.normal_map_path(view).exists()
+                    if last
+                    else _kept_file(folder, number, view).exists()
+                )
+                if not done:
+                    started = time.perf_counter()
+                    found = _search_view(job, view, number, options, seed, images, folder, executor)
+                    if last:
+                        _write_maps(job, view, found, options)
+                    else:
+                        _save(_kept_file(folder, number, view), found)
+                    logger.debug(
+                        "%s: pass %d of %d in %.1f s",
+                        job.views[view].name,
+                        number + 1,
+                        num_levels,
+                        time.perf_counter() - started,
+                    )
+                if progress is not None:
+                    progress((number * len(job.views) + view + 1) * len(job.views) // total, len(job.views))
+    shutil.rmtree(folder)
+
+
+def _search_view(
+    job: MvsJob,
+    view: int,
+    number: int,
+    options: PatchMatchOptions,
+    seed: int,
+    images: ImageCache,
+    folder: Path,
+    executor: Executor,
+) -> Hypotheses:
+    """Pass `number` for one view."""
+    level = _level(options, number)
+    camera = level_camera(job.views[view], level)
+    grey, _ = images.get(view, level)
+    limits = inverse_range(job, view, camera, _mask(job, view, camera.width, camera.height))
+    empty = np.zeros((0, 0, 3), np.float32)
+    calibration = camera.calibration
+    reference = Reference(
+        padded_grey=np.pad(grey, PADDING, mode="edge"),
+        inverse_range=limits,
+        intrinsics=np.array([calibration[0, 0], calibration[1, 1], calibration[0, 2], calibration[1, 2]], np.float32),
+        prior=empty,
+    )
+    sources = job.sources[view][: options.num_source_views]
+    if not sources or not (limits[..., 1] > 0).any():
+        shape = grey.shape
+        return Hypotheses(
+            plane=np.zeros((*shape, 3), np.float32),
+            cost=np.full(shape, 2, np.float32),
+            view=np.full(shape, -1, np.int8),
+        )
+    geometric = number > 0 and options.geometric_weight > 0
+
+    def previous(source: int) -> tuple[NDArray[np.float32], int]:
+        return _load(_kept_file(folder, number - 1, source)).plane, _level(options, number - 1)
+
+    search = LevelSearch(
+        reference=reference,
+        sources=gather_sources(job, view, sources, level, images, previous if geometric else None),
+        window=window(options),
+        options=options,
+        seed=seed + 1000003 * view + 7919 * number,
+        executor=executor,
+    )
+    if number == 0:
+        points, inverse_depths = sparse_points_in_image(job, view, camera)
+        start = search.start(interpolated_planes(points, inverse_depths, camera.width, camera.height))
+    else:
+        coarse = _load(_kept_file(folder, number - 1, view))
+        start = upsampled(coarse, images.get(view, _level(options, number - 1))[0], reference)
+    found = search.sweep(start, options.iterations[number], random_depth=number == 0)
+    if number == 0 and options.prior_iterations > 0:
+        found = search.with_prior(found).sweep(
+            found, options.prior_iterations, random_depth=False, first_iteration=options.iterations[0]
+        )
+    return found
+
+
+def _level(options: PatchMatchOptions, number: int) -> int:
+    return len(options.iterations) - 1 - number
+
+
+def _mask(job: MvsJob, view: int, width: int, height: int) -> NDArray[np.bool_] | None:
+    """True where depth is wanted; None without masks or for a view without one."""
+    if job.mask_dir is None:
+        return None
+    path = job.mask_dir / f"{job.views[view].name}.png"
+    if not path.exists():
+        return None
+    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if mask is None:
+        raise MvsError(f"cannot read mask {path}; remove or replace it")
+    # Nothing wanted is lost and nothing masked is kept at a coarse level: the last level decides.
+    return np.asarray(cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST)) > 0
+
+
+def _write_maps(job: MvsJob, view: int, found: Hypotheses, options: PatchMatchOptions) -> None:
+    """Filter the last pass' hypotheses and leave them as COLMAP's maps."""
+    plane = found.plane.copy()
+    plane[~(found.cost <= options.max_cost)] = 0.0
+    plane[_speckles(plane[..., 0], options.min_speckle_px)] = 0.0
+    depth, normal = depth_and_normal(plane, level_camera(job.views[view], 0).calibration)
+    known = depth[depth > 0]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+    depth_path, normal_path = job.depth_map_path(view), job.normal_map_path(view)
+    depth_partial, normal_partial = (p.with_name(f".{p.name}.partial") for p in (depth_path, normal_path))
+    for path in (depth_path, normal_path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    pycolmap.DepthMap.from_array(depth, depth_min=low, depth_max=high).write(depth_partial)
+    pycolmap.NormalMap.from_array(normal).write(normal_partial)
+    normal_partial.replace(normal_path)
+    depth_partial.replace(depth_path)
+
+
+def _speckles(inverse_depth: NDArray[np.float32], min_speckle_px: int) -> NDArray[np.bool_]:
+    """Pixels of connected pieces of fewer pixels, where neighbours of like depth (2 %) connect."""
+    known = inverse_depth > 0
+    steps = np.zeros(inverse_depth.shape, np.int16)
+    if known.any():
+        logs = np.log(inverse_depth[known])
+        steps[known] = 1 + np.minimum((logs - logs.min()) / 0.002, 32000).astype(np.int16)
+    cv2.filterSpeckles(steps, 0, min_speckle_px - 1, 10)
+    removed: NDArray[np.bool_] = known & (steps == 0)
+    return removed
+
+
+def _kept_folder(job: MvsJob, options: PatchMatchOptions, seed: int) -> Path:
+    """Where passes are kept; emptied if it holds those of another job or of other options."""
+    digest = hashlib.sha256(job.boxes_in_world.tobytes() + job.points_in_world.tobytes())
+    for view in job.views:
+        digest.update(view.name.encode() + view.calibration.tobytes() + view.cam_from_world.tobytes())
+    made_by = json.dumps([1, asdict(options), seed, job.sources, digest.hexdigest()], sort_keys=True)
+    folder = job.workspace / "stereo" / "patchmatch"
+    label = folder / "made_by.json"
+    if folder.exists() and not (label.exists() and label.read_text() == made_by):
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    label.write_text(made_by)
+    return folder
+
+
+def _kept_file(folder: Path, number: int, view: int) -> Path:
+    return folder / f"pass{number}_view{view:05d}.npz"
+
+
+def _save(path: Path, found: Hypotheses) -> None:
+    partial = path.with_name(f".{path.stem}.partial.npz")
+    np.savez(partial, plane=found.plane, cost=found.cost, view=found.view)
+    partial.replace(path)
+
+
+def _load(path: Path) -> Hypotheses:
+    with np.load(path) as data:
+        return Hypotheses(plane=data["plane"], cost=data["cost"], view=data["view"])

@@ -1,0 +1,71 @@
+"""Options of the PatchMatch search and what the presets set."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mvs_backends.base import MvsOptions, Preset
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatchMatchOptions:
+    """How depth is searched. Pixels are those of the level being searched unless said otherwise."""
+
+    num_source_views: int = 6
+    """Source views per reference view."""
+    max_cost_views: int = 4
+    """The cost of a hypothesis is averaged over the best of the source views, at most so many. ACMM: all."""
+    iterations: tuple[int, ...] = (6, 3, 2)
+    """Sweeps per level, coarse to fine; each level halves the pixel size."""
+    prior_iterations: int = 2
+    """Further sweeps at the coarsest level with the planar prior. ACMP: 3. 0: no planar prior."""
+    num_random: int = 8
+    """Random hypotheses per pixel at the start, beside the one interpolated from sparse points. ACMM: 1."""
+    geometric_weight: float = 0.2
+    """Weight lambda of the forward-backward reprojection error. ACMM: 0.2. 0: photometric only."""
+    max_geometric_error_px: float = 3.0
+    """Truncation delta of the reprojection error. ACMM: 3."""
+    sigma_space_px: float = 5.0
+    """Bilateral weight: spread over distance. ACMM: 5."""
+    sigma_grey: float = 12.0
+    """Bilateral weight: spread over grey values of 0 to 255. ACMM: 3 for COLMAP-like weights."""
+    min_angle_deg: float = 1.5
+    """Source views with a smaller triangulation angle lose weight quadratically. 0: no."""
+    max_cost: float = 0.7
+    """Pixels of a larger final cost get no depth."""
+    max_prior_cost: float = 0.15
+    """Pixels of at most this cost support the planar prior. ACMP: 0.1."""
+    prior_cell_px: int = 5
+    """One support pixel per cell of this size. ACMP: 5."""
+    min_speckle_px: int = 40
+    """Smaller connected pieces of a depth map are removed."""
+
+    def __post_init__(self) -> None:
+        for field in ("num_source_views", "max_cost_views", "num_random", "prior_cell_px"):
+            if getattr(self, field) < 1:
+                raise ValueError(f"{field} must be at least 1, not {getattr(self, field)}")
+        for field in ("prior_iterations", "geometric_weight", "min_angle_deg", "max_prior_cost", "min_speckle_px"):
+            if getattr(self, field) < 0:
+                raise ValueError(f"{field} must be at least 0, not {getattr(self, field)}")
+        for field in ("max_geometric_error_px", "sigma_space_px", "sigma_grey", "max_cost"):
+            if not getattr(self, field) > 0:
+                raise ValueError(f"{field} must be positive, not {getattr(self, field)}")
+        if not self.iterations or min(self.iterations) < 1:
+            raise ValueError(f"iterations must be one or more numbers of at least 1, not {self.iterations}")
+
+
+PRESETS = {
+    Preset.PREVIEW: PatchMatchOptions(num_source_views=4, max_cost_views=3, iterations=(5, 2), prior_iterations=2),
+    Preset.NORMAL: PatchMatchOptions(),
+    Preset.HIGH: PatchMatchOptions(num_source_views=9, max_cost_views=6, iterations=(8, 5, 4), prior_iterations=3),
+}
+"""`preview` stops at half the size: its maps are upsampled."""
+
+
+def options_of_preset(options: MvsOptions) -> PatchMatchOptions:
+    """The search that the general options ask for."""
+    preset = PRESETS[options.preset]
+    if options.num_source_views == 0:
+        return preset
+    values = {field: getattr(preset, field) for field in preset.__dataclass_fields__}
+    return PatchMatchOptions(**{**values, "num_source_views": options.num_source_views})

@@ -1,0 +1,226 @@
+"""One reference view's search at one level: from a start to a map of plane hypotheses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvs_backends.base import MvsJob
+from mvs_backends.depth_range import depth_range
+from mvs_backends.patchmatch.geometry import LevelCamera, level_camera, warp
+from mvs_backends.patchmatch.images import ImageCache
+from mvs_backends.patchmatch.kernels import (
+    Reference,
+    Search,
+    Sources,
+    State,
+    Window,
+    initialise_rows,
+    new_scratch,
+    sweep_rows,
+    upsample,
+)
+from mvs_backends.patchmatch.options import PatchMatchOptions
+from mvs_backends.patchmatch.prior import interpolated_planes, support_points
+
+_ROWS_PER_TASK = 8
+_MIN_SPARSE_POINTS = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hypotheses:
+    """A map of plane hypotheses at some level."""
+
+    plane: NDArray[np.float32]
+    """(H, W, 3) inverse depth and its slopes along x and y; 0 where nothing is searched."""
+    cost: NDArray[np.float32]
+    """(H, W)"""
+    view: NDArray[np.int8]
+    """(H, W) most important source view."""
+
+
+def window(options: PatchMatchOptions) -> Window:
+    """The matching window: every second pixel of 11 x 11, without the corners."""
+    offsets = [(x, y) for y in range(-5, 6, 2) for x in range(-5, 6, 2) if abs(x) + abs(y) < 10]
+    dx, dy = np.array(offsets, np.float32).T.copy()
+    grey = np.arange(256, dtype=np.float32)
+    return Window(
+        dx=dx,
+        dy=dy,
+        column=dx.astype(np.int64),
+        row=dy.astype(np.int64),
+        space_weight=np.exp(-(dx**2 + dy**2) / np.float32(2 * options.sigma_space_px**2)),
+        grey_weight=np.maximum(np.exp(-(grey**2) / np.float32(2 * options.sigma_grey**2)), np.float32(1e-4)),
+    )
+
+
+def sparse_points_in_image(
+    job: MvsJob, view: int, camera: LevelCamera
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(P, 2) pixels and (P,) inverse depths of the sparse points that a view observes."""
+    points = job.points_in_world[job.point_views[view]]
+    in_camera = points @ camera.cam_from_world[:, :3].T + camera.cam_from_world[:, 3]
+    in_camera = in_camera[in_camera[:, 2] > 0]
+    pixels = in_camera @ camera.calibration.T
+    return (pixels[:, :2] / pixels[:, 2:]).astype(np.float32), (1 / in_camera[:, 2]).astype(np.float32)
+
+
+def inverse_range(job: MvsJob, view: int, camera: LevelCamera, mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
+    """(H, W, 2) smallest and largest inverse depth of each pixel; 0, 0 where nothing is wanted."""
+    entry, leave = depth_range(job.views[view], job.boxes_in_world, camera.width, camera.height)
+    _, inverse_depths = sparse_points_in_image(job, view, camera)
+    if len(inverse_depths) >= _MIN_SPARSE_POINTS:
+        nearest = 0.5 / float(np.percentile(inverse_depths, 99))
+    else:
+        # Nearer than the nearest source view, a pixel's match is hardly ever in its image.
+        centers = [level_camera(job.views[s], 0).center_in_world for s in job.sources[view]]
+        nearest = 0.5 * min((float(np.linalg.norm(c - camera.center_in_world)) for c in centers), default=0.0)
+    entry = np.maximum(entry, nearest)
+    wanted = (leave > entry) & (entry > 0)
+    if mask is not None:
+        wanted &= mask
+    result = np.zeros((camera.height, camera.width, 2), np.float32)
+    result[wanted, 0] = 1 / leave[wanted]
+    result[wanted, 1] = 1 / entry[wanted]
+    return result
+
+
+def gather_sources(
+    job: MvsJob,
+    view: int,
+    sources: Sequence[int],
+    level: int,
+    images: ImageCache,
+    maps: Callable[[int], tuple[NDArray[np.float32], int]] | None,
+) -> Sources:
+    """Images, cameras and, with `maps`, the hypotheses of the source views as flat arrays for the kernels.
+
+    Args:
+        job: the cluster.
+        view: the reference view.
+        sources: its source views.
+        level: how often all images are halved.
+        images: where images come from.
+        maps: gives a view's hypothesis map and the level that it has.
+    """
+    reference = level_camera(job.views[view], level)
+    cameras = [level_camera(job.views[s], level) for s in sources]
+    packed = [images.get(s, level)[1] for s in sources]
+    to_reference = job.views[view].cam_from_world
+    centers = [to_reference[:, :3] @ c.center_in_world + to_reference[:, 3] for c in cameras]
+    planes = [np.zeros((0, 3), np.float32)]
+    sizes, to_map, from_map = [], [], []
+    for s in sources if maps is not None else ():
+        plane, map_level = maps(s) if maps is not None else (planes[0], 0)
+        camera = level_camera(job.views[s], map_level)
+        planes.append(plane.reshape(-1, 3))
+        sizes.append((camera.width, camera.height))
+        to_map.append(warp(camera, reference))
+        from_map.append(warp(reference, camera))
+    return Sources(
+        warp=np.stack([warp(c, reference) for c in cameras]),
+        centers=np.array(centers, np.float32),
+        texels=np.concatenate(packed),
+        first=np.cumsum([0, *(p.size for p in packed[:-1])]).astype(np.uint64),
+        width=np.array([c.width for c in cameras], np.int32),
+        limit=np.array([(c.width - 1.01, c.height - 1.01) for c in cameras], np.float32),
+        planes=np.concatenate(planes),
+        plane_first=np.cumsum([0, *(p.shape[0] for p in planes[1:-1])]).astype(np.uint64),
+        plane_size=np.array(sizes, np.int32).reshape(-1, 2),
+        to_map=np.array(to_map, np.float32).reshape(-1, 12),
+        from_map=np.array(from_map, np.float32).reshape(-1, 12),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelSearch:
+    """What a search at one level works on."""
+
+    reference: Reference
+    sources: Sources
+    window: Window
+    options: PatchMatchOptions
+    seed: int
+    executor: Executor
+
+    def _over_bands(self, kernel: Callable[..., None], mode: int, state: State, search: Search) -> None:
+        """Run a kernel over the image, bands of rows in parallel."""
+
+        def run(first_row: int) -> None:
+            last_row = min(first_row + _ROWS_PER_TASK, self.reference.inverse_range.shape[0])
+            scratch = new_scratch(len(self.sources.width))
+            kernel(first_row, last_row, mode, state, self.reference, self.sources, self.window, search, scratch)
+
+        for _ in self.executor.map(run, range(0, self.reference.inverse_range.shape[0], _ROWS_PER_TASK)):
+            pass
+
+    def _search(self, iteration: int, last: int, random_depth: bool) -> Search:
+        options = self.options
+        geometric = len(self.sources.plane_size) > 0
+        # Wide at first, below a tenth of a pixel at last.
+        shrink = 0.5 ** (iteration if random_depth else iteration + 1)
+        return Search(
+            seed=self.seed,
+            iteration=iteration,
+            max_views=options.max_cost_views,
+            geometric_weight=np.float32(options.geometric_weight if geometric else 0.0),
+            max_geometric_px=np.float32(options.max_geometric_error_px),
+            perturbation_px=np.float32(max(2.0 * shrink, 0.3)),
+            normal_perturbation=np.float32(max(0.5 * shrink, 0.06)),
+            min_angle_rad=np.float32(np.deg2rad(options.min_angle_deg)),
+            prior_depth_px=np.float32(1.0),
+            random_depth=int(random_depth),
+        )
+
+    def start(self, sparse: NDArray[np.float32]) -> Hypotheses:
+        """The best of planes between sparse points and random ones."""
+        state = State(
+            plane=sparse.copy(),
+            cost=np.empty(sparse.shape[:2], np.float32),
+            best_view=np.empty(sparse.shape[:2], np.int8),
+        )
+        search = self._search(0, 1, True)
+        self._over_bands(initialise_rows, self.options.num_random, state, search)
+        return Hypotheses(plane=state.plane, cost=state.cost, view=state.best_view)
+
+    def sweep(self, start: Hypotheses, iterations: int, random_depth: bool, first_iteration: int = 0) -> Hypotheses:
+        """Improve hypotheses by so many sweeps over the image."""
+        state = State(plane=start.plane.copy(), cost=start.cost.copy(), best_view=start.view.copy())
+        for iteration in range(first_iteration, first_iteration + iterations):
+            search = self._search(iteration, iterations, random_depth)
+            for colour in (0, 1):
+                self._over_bands(sweep_rows, colour, state, search)
+        return Hypotheses(plane=state.plane, cost=state.cost, view=state.best_view)
+
+    def with_prior(self, found: Hypotheses) -> LevelSearch:
+        """The same search with a planar prior from the reliable pixels of `found`."""
+        height, width = found.cost.shape
+        points, inverse_depths = support_points(
+            found.cost, found.plane[..., 0], self.options.prior_cell_px, self.options.max_prior_cost
+        )
+        prior = interpolated_planes(points, inverse_depths, width, height)
+        low, high = np.moveaxis(self.reference.inverse_range, -1, 0)
+        prior[(prior[..., 0] < low) | (prior[..., 0] > high)] = 0.0
+        return LevelSearch(
+            reference=self.reference._replace(prior=prior),
+            sources=self.sources,
+            window=self.window,
+            options=self.options,
+            seed=self.seed,
+            executor=self.executor,
+        )
+
+
+def upsampled(coarse: Hypotheses, coarse_grey: NDArray[np.uint8], reference: Reference) -> Hypotheses:
+    """Hypotheses of a coarser level as the start of a finer one."""
+    shape = reference.inverse_range.shape[:2]
+    state = State(
+        plane=np.empty((*shape, 3), np.float32), cost=np.empty(shape, np.float32), best_view=np.empty(shape, np.int8)
+    )
+    scale_y, scale_x = (np.float32(c / f) for c, f in zip(coarse_grey.shape, shape, strict=True))
+    upsample(coarse.plane, coarse.cost, coarse.view, coarse_grey, scale_x, scale_y, state, reference)
+    return Hypotheses(plane=state.plane, cost=state.cost, view=state.best_view)
