@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 _TRIALS = 1_000
@@ -13,6 +13,12 @@ _MAX_SCORED = 2_000
 _INLIER_SIGMAS = 3.0
 _MIN_SIGMA_M = 1e-3
 _MAX_AUTOCORRELATION = 0.9
+_LEVER_SIGMA_M = 2.0
+"""How far antennas are from cameras, before GPS says."""
+_MIN_LEVER_FRAMES = 10
+_MIN_EVIDENCE = 15.0
+"""Twice the log likelihood ratio that two more unknowns need: chance gives that once in 1,800 times."""
+_MIN_RIGHT = 0.5
 _RAYLEIGH_MEDIAN = 1.1774
 """Median length of a 2D vector of two unit normals."""
 _MAXWELL_MEDIAN = 1.5382
@@ -21,11 +27,13 @@ _MAXWELL_MEDIAN = 1.5382
 
 @dataclass(frozen=True, kw_only=True)
 class PlanarFit:
-    """target = scale * rotate(model, yaw) + offset in the plane, as complex numbers x + iy."""
+    """target = scale * rotate(model, yaw) + offset + rotate(lever, heading) in the plane, as complex numbers x + iy."""
 
     scale: float
     yaw_rad: float
     offset_m: complex
+    lever_m: complex
+    """Where the antenna is, from the camera: metres right of it and (imaginary part) in front of it. 0 if not told."""
     inliers: NDArray[np.bool_]
     """(F,)"""
     residuals_m: NDArray[np.float64]
@@ -37,7 +45,12 @@ class PlanarFit:
 
 
 def fit_planar(
-    model: NDArray[np.float64], target_m: NDArray[np.float64], *, seed: int, scale: float | None = None
+    model: NDArray[np.float64],
+    target_m: NDArray[np.float64],
+    *,
+    seed: int,
+    right: NDArray[np.float64] | None = None,
+    scale: float | None = None,
 ) -> PlanarFit | None:
     """Align 2D positions: least median of squares over pairs, then least squares over the inliers.
 
@@ -48,6 +61,8 @@ def fit_planar(
         model: (F, 2)
         target_m: (F, 2)
         seed: of the sampling.
+        right: (F, 2) the cameras' x axes in the plane. With them the antenna's place beside the camera is estimated,
+            and used if the data speak for one clearly: on a straight drive it is the same as an offset.
         scale: fixed scale; estimated if None.
 
     Returns:
@@ -56,49 +71,87 @@ def fit_planar(
     if len(model) < 3:
         return None
     source, target = model[:, 0] + 1j * model[:, 1], target_m[:, 0] + 1j * target_m[:, 1]
-    rng = np.random.default_rng(seed)
-    pairs = rng.integers(0, len(model), (_TRIALS, 2))
-    base = source[pairs[:, 1]] - source[pairs[:, 0]]
-    span = float(np.abs(source - source.mean()).max())
-    usable = np.abs(base) > 1e-6 * span
-    if span == 0.0 or not usable.any():
+    start = _least_median(source, target, np.random.default_rng(seed), scale)
+    if start is None:
         return None
-    pairs, base = pairs[usable], base[usable]
-    factors = (target[pairs[:, 1]] - target[pairs[:, 0]]) / base
+    ones = np.ones((len(model), 1), dtype=np.complex128)
+    plain = _refine(source, target, ones, start, scale)
+    if right is None or not (np.linalg.norm(right, axis=1) > _MIN_RIGHT).all():
+        return plain
+    turns = (right[:, 0] + 1j * right[:, 1]) / np.linalg.norm(right, axis=1)
+    levered = _refine(source, target, np.column_stack((ones, turns)), start, scale)
+    return levered if _is_clearly_better(levered, plain) else plain
+
+
+def _is_clearly_better(levered: PlanarFit, plain: PlanarFit) -> bool:
+    """Likelihood ratio test over the positions that fit with the lever."""
+    chosen = levered.inliers
+    residual = float((levered.residuals_m[chosen] ** 2).sum()) + int(chosen.sum()) * _MIN_SIGMA_M**2
+    ratio = float((plain.residuals_m[chosen] ** 2).sum()) / residual
+    return (
+        int(chosen.sum()) >= _MIN_LEVER_FRAMES and 2.0 * int(chosen.sum()) * math.log(max(ratio, 1.0)) > _MIN_EVIDENCE
+    )
+
+
+def _least_median(
+    source: NDArray[np.complex128], target: NDArray[np.complex128], rng: np.random.Generator, scale: float | None
+) -> tuple[complex, complex, float] | None:
+    """Factor, offset and median residual of the pair whose similarity has the smallest median residual."""
+    pairs = rng.integers(0, len(source), (_TRIALS, 2))
+    base = source[pairs[:, 1]] - source[pairs[:, 0]]
+    usable = np.abs(base) > 1e-6 * float(np.abs(source - source.mean()).max())
+    factors = (target[pairs[usable, 1]] - target[pairs[usable, 0]]) / base[usable]
+    pairs = pairs[usable]
     if scale is not None:
         moved = np.abs(factors) > 0.0
         pairs, factors = pairs[moved], factors[moved] * (scale / np.abs(factors[moved]))
     if not len(factors):
         return None
     offsets = target[pairs[:, 0]] - factors * source[pairs[:, 0]]
-    scored = _scored_rows(len(model), rng)
-    medians = np.median(
-        np.abs(factors[:, None] * source[None, scored] + offsets[:, None] - target[None, scored]), axis=1
-    )
+    scored = _scored_rows(len(source), rng)
+    medians = np.median(np.abs(factors[:, None] * source[scored] + offsets[:, None] - target[scored]), axis=1)
     best = int(np.argmin(medians))
-    factor, offset = complex(factors[best]), complex(offsets[best])
-    sigma = max(float(medians[best]) / _RAYLEIGH_MEDIAN, _MIN_SIGMA_M)
-    inliers = np.ones(len(model), dtype=np.bool_)
+    return complex(factors[best]), complex(offsets[best]), float(medians[best])
+
+
+def _refine(
+    source: NDArray[np.complex128],
+    target: NDArray[np.complex128],
+    basis: NDArray[np.complex128],
+    start: tuple[complex, complex, float],
+    scale: float | None,
+) -> PlanarFit:
+    """Least squares for target = factor * source + basis @ coefficients over the inliers, again and again."""
+    factor, offset, median = start
+    coefficients = np.zeros(basis.shape[1], dtype=np.complex128)
+    coefficients[0] = offset
+    sigma = max(median / _RAYLEIGH_MEDIAN, _MIN_SIGMA_M)
+    inliers = np.ones(len(source), dtype=np.bool_)
+    information = 0.0
     for _ in range(20):
-        chosen = np.abs(factor * source + offset - target) <= _INLIER_SIGMAS * sigma
+        chosen = np.abs(factor * source + basis @ coefficients - target) <= _INLIER_SIGMAS * sigma
         if chosen.sum() < 3:
             break
         inliers = chosen
-        factor, offset = _least_squares(source[inliers], target[inliers], scale)
-        sigma = max(float(np.median(np.abs(factor * source + offset - target))) / _RAYLEIGH_MEDIAN, _MIN_SIGMA_M)
-    errors = factor * source + offset - target
-    centered = source[inliers] - source[inliers].mean()
-    freedom = max(2 * int(inliers.sum()) - 4, 1)
+        ridge = np.zeros(basis.shape[1])
+        ridge[1:] = (sigma / _LEVER_SIGMA_M) ** 2
+        factor, coefficients, information = _least_squares(source[chosen], target[chosen], basis[chosen], ridge, scale)
+        sigma = np.median(np.abs(factor * source + basis @ coefficients - target)) / _RAYLEIGH_MEDIAN
+        sigma = max(float(sigma), _MIN_SIGMA_M)
+    errors = factor * source + basis @ coefficients - target
+    freedom = max(2 * int(inliers.sum()) - 2 - 2 * basis.shape[1], 1)
     noise = max(float(np.sqrt((np.abs(errors[inliers]) ** 2).sum() / freedom)), _MIN_SIGMA_M)
-    lever = abs(factor) * float(np.sqrt((np.abs(centered) ** 2).sum()))
+    arm = abs(factor) * math.sqrt(information)
+    turn = factor / abs(factor) if abs(factor) > 0.0 else 1.0
     return PlanarFit(
         scale=abs(factor),
         yaw_rad=float(np.angle(factor)),
-        offset_m=offset,
+        offset_m=complex(coefficients[0]),
+        lever_m=complex(coefficients[1] / turn) if basis.shape[1] > 1 else 0j,
         inliers=inliers,
         residuals_m=np.abs(errors),
         sigma_m=noise,
-        scale_relative_sigma=noise * correlation_inflation(errors[inliers]) / lever if lever > 0.0 else np.inf,
+        scale_relative_sigma=noise * correlation_inflation(errors[inliers]) / arm if arm > 0.0 else math.inf,
     )
 
 
@@ -225,24 +278,40 @@ def _scored_rows(count: int, rng: np.random.Generator) -> NDArray[np.int64]:
 
 
 def _least_squares(
-    source: NDArray[np.complex128], target: NDArray[np.complex128], scale: float | None
-) -> tuple[complex, complex]:
-    centered = source - source.mean()
-    factor = complex((np.conj(centered) * (target - target.mean())).sum())
-    power = float((np.abs(centered) ** 2).sum())
-    if scale is None:
-        factor = factor / power if power > 0.0 else 1.0
+    source: NDArray[np.complex128],
+    target: NDArray[np.complex128],
+    basis: NDArray[np.complex128],
+    ridge: NDArray[np.float64],
+    scale: float | None,
+) -> tuple[complex, NDArray[np.complex128], float]:
+    """Factor (of absolute value ``scale`` if given), coefficients, and the information about the factor."""
+    normal = np.linalg.inv(basis.conj().T @ basis + np.diag(ridge))
+    projected = source - basis @ (normal @ (basis.conj().T @ source))
+    product = complex((np.conj(projected) * target).sum())
+    information = max(float(np.real((np.conj(projected) * source).sum())), 0.0)
+    if scale is not None:
+        factor = scale * product / abs(product) if abs(product) > 0.0 else complex(scale)
     else:
-        factor = scale * factor / abs(factor) if abs(factor) > 0.0 else complex(scale)
-    return factor, complex(target.mean() - factor * source.mean())
+        factor = product / information if information > 0.0 else 1.0 + 0j
+    return factor, normal @ (basis.conj().T @ (target - factor * source)), information
 
 
 def _similarity(model: NDArray[np.float64], target_m: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    found = pycolmap.estimate_sim3d(model, target_m)
-    if found is None:
+    """(3, 4) least-squares similarity (Umeyama 1991), also for positions in a plane or on a line.
+
+    COLMAP's own gives up on positions in a plane, which is what a drive over level ground makes.
+    """
+    source, target = model - model.mean(axis=0), target_m - target_m.mean(axis=0)
+    power = float((source**2).sum())
+    if power == 0.0:
         return None
-    matrix: NDArray[np.float64] = np.asarray(found.matrix(), dtype=np.float64)
-    return matrix if np.isfinite(matrix).all() and np.linalg.det(matrix[:, :3]) > 0.0 else None
+    u, values, vt = np.linalg.svd(target.T @ source)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = (u * signs) @ vt
+    scale = float((values * signs).sum()) / power
+    if scale <= 0.0:
+        return None
+    return np.column_stack((scale * rotation, target_m.mean(axis=0) - scale * rotation @ model.mean(axis=0)))
 
 
 def _errors(

@@ -24,6 +24,8 @@ class ModelFrames:
     frames: tuple[FrameEntry, ...]
     positions_in_model: NDArray[np.float64]
     """(F, 3) centre of the frame's reference camera."""
+    right_in_model: NDArray[np.float64] | None
+    """(F, 3) x axis of the frame's reference camera; None where frames come from several cameras that are no rig."""
     image_frames: NDArray[np.int64]
     """(N,) frame of each of the scene's images; -1 for images that the inventory doesn't have."""
     image_cameras: NDArray[np.int64]
@@ -71,22 +73,25 @@ def model_frames(scene: PosedScene, inventory: Inventory | None) -> ModelFrames:
     cameras = tuple(sorted(set(names), key=natural_key))
     index_of = {camera: index for index, camera in enumerate(cameras)}
     image_cameras = np.array([index_of[name] for name in names], dtype=np.int64)
+    positions, right = _reference_cameras(scene, image_frames, image_cameras, len(kept), is_rig)
     return ModelFrames(
         frames=tuple(kept),
-        positions_in_model=_positions(scene, image_frames, image_cameras, len(kept), is_rig),
+        positions_in_model=positions,
+        right_in_model=right if is_rig or len(cameras) == 1 else None,
         image_frames=image_frames,
         image_cameras=image_cameras,
         cameras=cameras,
     )
 
 
-def _positions(
+def _reference_cameras(
     scene: PosedScene,
     image_frames: NDArray[np.int64],
     image_cameras: NDArray[np.int64],
     num_frames: int,
     is_rig: bool,
-) -> NDArray[np.float64]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(F, 3) centre and (F, 3) x axis of each frame's reference camera."""
     centers = scene.centers_in_world
     rotations = scene.cam_from_world[:, :, :3]
     num_cameras = int(image_cameras.max()) + 1
@@ -94,17 +99,28 @@ def _positions(
     known = np.flatnonzero(image_frames >= 0)
     row[image_cameras[known], image_frames[known]] = known
     positions = np.full((num_frames, 3), np.nan)
+    right = np.full((num_frames, 3), np.nan)
     # The camera with the most images first, so that most offsets come from many frames.
     order = np.argsort(-(row >= 0).sum(axis=1), kind="stable")
     for camera in order:
         here = row[camera] >= 0
         rows = row[camera, here]
-        estimate = centers[rows]
+        estimate, axes = centers[rows], rotations[rows, 0, :]
         both = here & np.isfinite(positions[:, 0])
         if is_rig and both.any():
             shared = row[camera, both]
-            offsets = np.einsum("nij,nj->ni", rotations[shared], positions[both] - centers[shared])
-            estimate = estimate + np.einsum("nji,j->ni", rotations[rows], np.median(offsets, axis=0))
+            offset = np.median(_rotate(rotations[shared], positions[both] - centers[shared]), axis=0)
+            axis = np.median(_rotate(rotations[shared], right[both]), axis=0)
+            from_camera = rotations[rows].transpose(0, 2, 1)
+            estimate = estimate + from_camera @ offset
+            axes = from_camera @ (axis / np.linalg.norm(axis))
         missing = ~np.isfinite(positions[here, 0])
         positions[np.flatnonzero(here)[missing]] = estimate[missing]
-    return positions
+        right[np.flatnonzero(here)[missing]] = axes[missing]
+    return positions, right
+
+
+def _rotate(rotations: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 3) each vector by its (3, 3) rotation."""
+    rotated: NDArray[np.float64] = np.einsum("nij,nj->ni", rotations, vectors)
+    return rotated

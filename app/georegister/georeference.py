@@ -60,6 +60,8 @@ class Residuals:
     """None when the source gives no heights."""
     vertical_median_m: float | None
     vertical_max_m: float | None
+    antenna_m: tuple[float, float] | None = None
+    """The antenna's place right of and in front of the reference camera, where the data tell; residuals are to it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +110,10 @@ class Georeference:
             data["origin_deg_m"] = tuple(data["origin_deg_m"]) if data["origin_deg_m"] else None
             data["world_from_model"] = tuple(data["world_from_model"])
             data["outlier_frames"] = tuple(data["outlier_frames"])
-            data["residuals"] = Residuals(**data["residuals"]) if data["residuals"] else None
+            residuals = data["residuals"]
+            if residuals:
+                residuals["antenna_m"] = tuple(residuals["antenna_m"]) if residuals["antenna_m"] else None
+            data["residuals"] = Residuals(**residuals) if residuals else None
             data["scale_candidates"] = tuple(
                 ScaleCandidate(**{**candidate, "source": ScaleSource(candidate["source"])})
                 for candidate in data["scale_candidates"]

@@ -132,7 +132,7 @@ def georegister(
     planar = _level_axes(up.direction) if not options.z_is_up else np.eye(3)[:2]
     gps_fit = None
     if gps is not None:
-        gps_fit = fit_planar(frames.positions_in_model[gps.rows] @ planar.T, gps.enu_m[:, :2], seed=options.seed)
+        gps_fit = _fit_gps(frames, gps, planar, options)
         if gps_fit is None:
             logger.warning("the GPS positions fit no common track, or all lie in one place: GPS is not used")
             gps = None
@@ -188,6 +188,20 @@ def _gps(frames: ModelFrames) -> _Gps | None:
     enu = np.array(transform.ellipsoid_to_enu(geodetic, *origin))
     enu[~has_height, 2] = np.nan
     return _Gps(rows=rows, enu_m=enu, origin_deg_m=origin)
+
+
+def _fit_gps(
+    frames: ModelFrames,
+    gps: _Gps,
+    planar: NDArray[np.float64],
+    options: GeoregisterOptions,
+    *,
+    scale: float | None = None,
+) -> PlanarFit | None:
+    """Yaw, scale and place of the track, seen from above: ``planar`` is (2, 3), the model's level axes."""
+    right = frames.right_in_model[gps.rows] @ planar.T if frames.right_in_model is not None else None
+    positions = frames.positions_in_model[gps.rows] @ planar.T
+    return fit_planar(positions, gps.enu_m[:, :2], seed=options.seed, right=right, scale=scale)
 
 
 def _find_up(scene: PosedScene, frames: ModelFrames, gps: _Gps | None, options: GeoregisterOptions) -> _Up:
@@ -254,7 +268,7 @@ def _add_heights(
     for _ in range(3):
         planar = _level_axes(up)
         positions = frames.positions_in_model[gps.rows]
-        fit = fit_planar(positions @ planar.T, gps.enu_m[:, :2], seed=options.seed)
+        fit = _fit_gps(frames, gps, planar, options)
         if fit is None or fit.scale_relative_sigma > _MAX_SCALE_SIGMA:
             return up, sigma_deg, source
         usable = known & fit.inliers
@@ -339,17 +353,19 @@ def _onto_gps(
     positions = frames.positions_in_model[gps.rows]
     fit = free_fit
     if scale != free_fit.scale:
-        fixed = fit_planar(positions @ planar.T, gps.enu_m[:, :2], seed=options.seed, scale=scale)
+        fixed = _fit_gps(frames, gps, planar, options, scale=scale)
         fit = fixed if fixed is not None else free_fit
     cos, sin = math.cos(fit.yaw_rad), math.sin(fit.yaw_rad)
     rotation = np.vstack((np.array([[cos, -sin], [sin, cos]]) @ planar, up.direction))
     heights = scale * positions @ up.direction
     usable = fit.inliers & np.isfinite(gps.enu_m[:, 2])
     known_heights = bool(usable.any())
-    shift = float(np.median(gps.enu_m[usable, 2] - heights[usable])) if known_heights else -float(np.median(heights))
+    shift = _robust_mean(gps.enu_m[usable, 2] - heights[usable]) if known_heights else -float(np.median(heights))
     vertical = np.abs(gps.enu_m[usable, 2] - heights[usable] - shift)
     transform = np.column_stack((scale * rotation, (fit.offset_m.real, fit.offset_m.imag, shift)))
     horizontal = fit.residuals_m[fit.inliers]
+    if fit.lever_m:
+        logger.info("the GPS antenna is %.2f m right and %.2f m in front of the camera", *_parts(fit.lever_m))
     residuals = Residuals(
         num_frames=len(gps.rows),
         num_inliers=int(fit.inliers.sum()),
@@ -359,6 +375,7 @@ def _onto_gps(
         vertical_rms_m=float(np.sqrt((vertical**2).mean())) if known_heights else None,
         vertical_median_m=float(np.median(vertical)) if known_heights else None,
         vertical_max_m=float(vertical.max()) if known_heights else None,
+        antenna_m=_parts(fit.lever_m) if fit.lever_m else None,
     )
     names = [frames.frames[row].name for row in gps.rows[~fit.inliers]]
     return transform, residuals, tuple(names[:_MAX_OUTLIER_NAMES])
@@ -380,6 +397,16 @@ def _onto_ground(
     if up.ground is not None:
         translation[2] += scale * up.ground.height
     return np.column_stack((scale * rotation, translation))
+
+
+def _robust_mean(values: NDArray[np.float64]) -> float:
+    """Mean of the values within 3 standard deviations of the median."""
+    inliers, _ = robust_line_sigma(np.empty((len(values), 0)), values)
+    return float(values[inliers].mean())
+
+
+def _parts(number: complex) -> tuple[float, float]:
+    return number.real, number.imag
 
 
 def _level_axes(up: NDArray[np.float64]) -> NDArray[np.float64]:

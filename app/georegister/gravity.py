@@ -23,6 +23,7 @@ _MAX_LEANING_DEG = 60.0
 _MIN_COMMON_UP = 0.3
 _MAX_GROUND_TILT_DEG = 20.0
 _MIN_DEPRESSION_DEG, _MAX_DEPRESSION_DEG = 8.0, 80.0
+_MAX_OBSERVATIONS = 1_000_000
 _MAX_GROUND_POINTS = 20_000
 _GROUND_TRIALS = 1_000
 _GROUND_TOLERANCE = 0.06
@@ -158,8 +159,8 @@ def find_ground(scene: PosedScene, up: NDArray[np.float64], *, seed: int) -> Gro
     Returns:
         The plane, or None if too few points agree on one.
     """
-    rays = _rays_down(scene, up)
     rng = np.random.default_rng(seed)
+    rays = _rays_down(scene, up, rng)
     if len(rays) > _MAX_GROUND_POINTS:
         rays = rays[np.sort(rng.choice(len(rays), _MAX_GROUND_POINTS, replace=False))]
     if len(rays) < _MIN_GROUND_POINTS:
@@ -199,12 +200,13 @@ def angle_deg(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second)))
 
 
-def _rays_down(scene: PosedScene, up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(R, 3) offsets from the camera to the points that it sees well below its horizon."""
-    if not len(scene.point_ids):
-        return np.empty((0, 3))
-    observers = scene.track_images[scene.track_offsets[:-1]]
-    rays = scene.points_in_world - scene.centers_in_world[observers]
+def _rays_down(scene: PosedScene, up: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    """(R, 3) offsets from cameras to the points that they see well below their horizon."""
+    observations = np.arange(len(scene.track_images))
+    if len(observations) > _MAX_OBSERVATIONS:
+        observations = np.sort(rng.choice(len(observations), _MAX_OBSERVATIONS, replace=False))
+    points = np.searchsorted(scene.track_offsets, observations, side="right") - 1
+    rays = scene.points_in_world[points] - scene.centers_in_world[scene.track_images[observations]]
     lengths = np.linalg.norm(rays, axis=1)
     sines = -(rays @ up) / np.where(lengths > 0.0, lengths, 1.0)
     low, high = np.sin(np.radians((_MIN_DEPRESSION_DEG, _MAX_DEPRESSION_DEG)))
