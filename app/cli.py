@@ -76,10 +76,13 @@ def full(
     dry_run: DryRunOption = False,
 ) -> None:
     """Images in, point cloud out: all stages, each skipped if its work is done."""
-    from app.pipeline import full_pipeline
+    from app.pipeline import full_pipeline, plan_full
     from app.stages import CaptureSources
 
     sources = CaptureSources(images=images, gps=gps, rig=rig, masks=masks)
+    if dry_run:
+        plan_full(run, sources, out=out.absolute())
+        return
     full_pipeline(
         run,
         sources,
@@ -88,7 +91,6 @@ def full(
         model=model,
         compare_batch=compare_batch,
         allow_partial=allow_partial,
-        dry_run=dry_run,
     )
 
 

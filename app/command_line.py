@@ -153,6 +153,8 @@ def _run_locked(
             if is_new and not any(workspace.root.glob(f"*/{RECORD}")):
                 remove_tree(workspace.root)
             raise
+        if is_new and kept.get("dry_run"):
+            remove_tree(workspace.root)
 
 
 def load_config(file: Path | None, settings: list[str]) -> RunConfig:
@@ -187,7 +189,7 @@ def _flags(section: str) -> list[inspect.Parameter]:
         default = getattr(defaults, name)
         text = option_docs(options)[name]
         if default is not None and default != "":
-            text += f" [default: {' '.join(map(str, default)) if isinstance(default, tuple) else default}]"
+            text += f" Default: {' '.join(map(str, default)) if isinstance(default, tuple) else default}."
         spelling = f"--{flag}/--no-{flag}" if kind is bool else f"--{flag}"
         annotation = Annotated[_flag_type(kind), typer.Option(spelling, help=text, show_default=False)]
         flags.append(_parameter(f"{section}__{name}", annotation, None))

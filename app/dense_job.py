@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from app.errors import CityReconError
 from app.scene.posed_scene import PosedScene
@@ -22,6 +23,10 @@ from app.workspace import atomic_file
 from fusion.region import GroundRegion
 from mvs_backends.base import MvsJob, MvsView
 from mvs_backends.source_views import choose_source_views
+
+
+_MAX_SOURCES = 20
+"""Per reference view, best first; a back-end takes as many of them as it wants."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,7 +182,7 @@ def _undistort_mask(
     _write_image(target, np.where(undistorted.to_array() > 254, 255, 0).astype(np.uint8))
 
 
-def _write_image(path: Path, pixels: np.ndarray) -> None:
+def _write_image(path: Path, pixels: NDArray[np.uint8]) -> None:
     ok, encoded = cv2.imencode(path.suffix, pixels, [cv2.IMWRITE_JPEG_QUALITY, 98])
     if not ok:
         raise CityReconError(f"cannot encode {path}")
@@ -207,12 +212,29 @@ def _mvs_job(model: pycolmap.Reconstruction, job: DenseJob, workspace: Path, *, 
     return MvsJob(
         workspace=workspace,
         views=tuple(views),
-        sources=choose_source_views(views=views, points_in_world=points, point_views=seen, boxes_in_world=boxes),
+        sources=choose_source_views(
+            views=views,
+            points_in_world=points,
+            point_views=seen,
+            samples_in_world=_samples(job.region),
+            max_sources=_MAX_SOURCES,
+        ),
         boxes_in_world=boxes,
         points_in_world=points,
         point_views=tuple(seen),
         mask_dir=workspace / "masks" if has_masks else None,
     )
+
+
+def _samples(region: GroundRegion) -> NDArray[np.float64]:
+    """(S, 3) uniform samples of a region, where keypoints are few ([O] section 3); a tenth of a cell apart."""
+    boxes = region.padded_boxes()
+    spacing = min(region.cell_size_m) / 10
+    grids = [
+        np.stack(np.meshgrid(*(np.arange(a, b, spacing) for a, b in zip(*box, strict=True)), indexing="ij"), -1)
+        for box in boxes
+    ]
+    return np.concatenate([grid.reshape(-1, 3) for grid in grids])
 
 
 def _write_stereo_folder(job: MvsJob) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import pycolmap
@@ -13,11 +14,11 @@ from app.clustering.clusters import Clustering
 from app.config import RunConfig
 from app.dense_job import DenseJob, write_dense_job
 from app.densify import Task, densify_inputs, densify_job, fuse_inputs, fuse_job, run_tasks
-from app.errors import CityReconError
+from app.errors import CityReconError, InputError
 from app.executor import split_cores
 from app.log import ProgressLine
 from app.scene.read_model import read_posed_scene
-from app.stage import StageRecord, finished_product, run_stage
+from app.stage import StageRecord, finished_product, is_current, run_stage
 from app.view_selection.selection import read_selections
 from app.workspace import Workspace, atomic_file, remove_tree
 from fusion.merge import merge_clouds
@@ -109,15 +110,13 @@ def densify_stage(
     Raises:
         CityReconError: the back-end can't run here.
     """
-    availability = get_backend(config.densify.backend).availability()
-    if not availability.ok:
-        raise CityReconError(f"back-end {config.densify.backend} can't run here: {availability.reason}")
+    check_backend(config)
     inventory = Inventory.read(workspace.inventory_file)
     num_workers, num_threads = split_cores(len(jobs), num_jobs)
     tasks = {
         name: Task(
             folder=folder / name,
-            options={"densify": config.densify, "stereo": config.stereo},
+            options=_densify_options(config),
             inputs=densify_inputs(job),
             arguments=(
                 job,
@@ -134,6 +133,53 @@ def densify_stage(
     }
     _remove_strangers(folder, tasks)
     return run_tasks("densify", densify_job, tasks, num_workers=num_workers, log_file=workspace.log_file)
+
+
+def check_backend(config: RunConfig) -> None:
+    """Refuse a back-end that doesn't exist or can't run, before hours of other work.
+
+    Raises:
+        InputError: no such back-end.
+        CityReconError: it can't run here.
+    """
+    try:
+        availability = get_backend(config.densify.backend).availability()
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    if not availability.ok:
+        raise CityReconError(f"back-end {config.densify.backend} can't run here: {availability.reason}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DensifyWork:
+    """How much is left to do."""
+
+    num_jobs: int
+    num_views: int
+    megapixels: float
+
+
+def densify_work(config: RunConfig, *, jobs: Mapping[str, Path], folder: Path) -> DensifyWork:
+    """What `densify_stage` would have to do."""
+    todo = [
+        DenseJob.read(job)
+        for name, job in jobs.items()
+        if not is_current(folder / name, options=_densify_options(config), inputs=densify_inputs(job))
+    ]
+    pixels = 0.0
+    for job in todo:
+        for image in job.images:
+            camera = job.cameras[image.camera_id]
+            longer = max(camera.width, camera.height)
+            scale = min(1.0, (config.densify.max_image_size_px or longer) / longer)
+            pixels += scale**2 * camera.width * camera.height
+    return DensifyWork(
+        num_jobs=len(todo), num_views=sum(len(job.images) for job in todo), megapixels=round(pixels / 1e6, 2)
+    )
+
+
+def _densify_options(config: RunConfig) -> dict[str, object]:
+    return {"densify": config.densify, "stereo": config.stereo}
 
 
 def fuse_stage(

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import logging
+import os
+import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from app.capture.inventory import Inventory
+from app.capture.capture import capture
+from app.capture.describe import describe
 from app.command_line import Run
 from app.comparison import compare_files
-from app.dense_job import DenseJob
-from app.dense_stages import batch_jobs, cluster_jobs, densify_stage, fuse_stage
+from app.dense_stages import batch_jobs, check_backend, cluster_jobs, densify_stage, densify_work, fuse_stage
 from app.errors import CityReconError, InputError
 from app.log import format_seconds
 from app.stages import (
@@ -19,11 +21,10 @@ from app.stages import (
     capture_stage,
     cluster_stage,
     georegister_stage,
-    plan_stages,
     select_stage,
     sfm_stage,
 )
-from app.workspace import Workspace
+from app.stage import RECORD, StageRecord
 
 logger = logging.getLogger(__name__)
 
@@ -45,6 +46,7 @@ def full_pipeline(
     """
     start = time.monotonic()
     check_output(out)
+    check_backend(run.config)
     logger.info("workspace: %s", run.workspace.root)
     _announce(1, "capture: taking stock of the images")
     capture_stage(run.workspace, sources, run.config)
@@ -64,7 +66,7 @@ def full_pipeline(
         _announce(8, "batch: reconstructing the whole set at once, to compare")
         batch = run.workspace.batch_cloud_file
         batch_reconstruction(run, out=batch)
-        comparison = run.workspace.comparison_dir
+        comparison = run.workspace.root / "compare"
         comparison.mkdir(exist_ok=True)
         text = compare_files(
             out,
@@ -76,6 +78,33 @@ def full_pipeline(
         )
         logger.info("%s\nfigures and picture in %s", text, comparison)
     logger.info("done in %s", format_seconds(time.monotonic() - start))
+
+
+def plan_full(run: Run, sources: CaptureSources, *, out: Path) -> None:
+    """Check the input and say what `full_pipeline` would do.
+
+    Raises:
+        InputError: it couldn't begin.
+    """
+    check_output(out)
+    check_backend(run.config)
+    with tempfile.TemporaryDirectory() as scratch:
+        inventory = capture(
+            sources.images,
+            Path(scratch),
+            options=run.config.capture,
+            gps_file=sources.gps,
+            rig_file=sources.rig,
+            mask_dir=sources.masks,
+        )
+    logger.info("%s", describe(inventory))
+    for stage in ("capture", "sfm", "georegister", "clusters", "selection"):
+        record = StageRecord.read(run.workspace.root / stage)
+        state = "to do" if record is None else f"done before in {format_seconds(record.seconds)}, kept if nothing changed"
+        logger.info("%-12s %s", stage, state)
+    done = len(list((run.workspace.root / "dense").glob(f"*/{RECORD}")))
+    logger.info("%-12s %s", "dense", f"{done} clusters done before" if done else "to do")
+    logger.info("would write  %s", out)
 
 
 def _announce(number: int, text: str) -> None:
@@ -98,9 +127,12 @@ def check_output(out: Path) -> None:
         raise InputError(f"folder {out.parent} can't be written; choose another output")
 
 
-def densify_clusters(run: Run, *, allow_partial: bool) -> None:
-    """Depth and normal maps of every cluster."""
+def densify_clusters(run: Run, *, allow_partial: bool, dry_run: bool = False) -> None:
+    """Depth and normal maps of every cluster, or how much work that is."""
     jobs = cluster_jobs(run.workspace)
+    if dry_run:
+        _log_work(run, jobs, run.workspace.root / "dense")
+        return
     failures = densify_stage(
         run.workspace, run.config, jobs=jobs, folder=run.workspace.root / "dense", num_jobs=run.num_jobs
     )
@@ -122,10 +154,13 @@ def fuse_clusters(run: Run, *, out: Path, allow_partial: bool) -> None:
     _check(failures, len(jobs), allow_partial=allow_partial)
 
 
-def batch_reconstruction(run: Run, *, out: Path) -> None:
-    """One cloud of the whole set at once."""
+def batch_reconstruction(run: Run, *, out: Path, dry_run: bool = False) -> None:
+    """One cloud of the whole set at once, or how much work that is."""
     folder = run.workspace.root / "batch"
     jobs = batch_jobs(run.workspace)
+    if dry_run:
+        _log_work(run, jobs, folder / "dense")
+        return
     _check(
         densify_stage(run.workspace, run.config, jobs=jobs, folder=folder / "dense", num_jobs=1), 1, allow_partial=False
     )
@@ -139,6 +174,18 @@ def batch_reconstruction(run: Run, *, out: Path) -> None:
         num_jobs=1,
     )
     _check(failures, 1, allow_partial=False)
+
+
+def _log_work(run: Run, jobs: Mapping[str, Path], folder: Path) -> None:
+    work = densify_work(run.config, jobs=jobs, folder=folder)
+    logger.info(
+        "densify: %d of %d jobs to do, %d depth maps of %.1f megapixels in all with %s",
+        work.num_jobs,
+        len(jobs),
+        work.num_views,
+        work.megapixels,
+        run.config.densify.backend,
+    )
 
 
 def _check(failures: Mapping[str, str], total: int, *, allow_partial: bool) -> None:

@@ -2,32 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import pycolmap
-
 from app.capture.inventory import Inventory
 from app.config import RunConfig
-
-from app.densify import (
-    Task,
-    check_failures,
-    densify_inputs,
-    densify_job,
-    fuse_inputs,
-    fuse_job,
-    run_tasks,
-    write_failures,
-)
-from app.errors import CityReconError, InputError
-from app.executor import split_cores
+from app.executor import available_cores, split_cores
+from app.georegister.georeference import Georeference
 from app.log import ProgressLine
-from app.stage import StageRecord, digest, digest_files, finished_product, run_stage
-from app.workspace import Workspace, atomic_file
+from app.stage import digest, digest_files, finished_product, run_stage
+from app.workspace import Workspace
 
 logger = logging.getLogger(__name__)
 
@@ -46,7 +32,7 @@ class CaptureSources:
 def capture_stage(workspace: Workspace, sources: CaptureSources, config: RunConfig) -> str:
     """Take stock of the images, or extract frames from videos."""
     from app.capture.capture import capture
-    from app.capture.description import describe
+    from app.capture.describe import describe
 
     def work(partial: Path) -> None:
         capture(
@@ -82,7 +68,8 @@ def capture_stage(workspace: Workspace, sources: CaptureSources, config: RunConf
 
 def sfm_stage(workspace: Workspace, config: RunConfig, *, model: Path | None, poses: Path | None) -> str:
     """Poses and sparse points: from the images, from an existing model, or from the images with known poses."""
-    from app.sfm.stage import import_model, run_sfm
+    from app.sfm.imports import import_model
+    from app.sfm.stage import run_sfm
 
     inventory_product = finished_product(workspace.root / "capture", "capture")
     inventory = Inventory.read(workspace.inventory_file)
@@ -108,8 +95,9 @@ def sfm_stage(workspace: Workspace, config: RunConfig, *, model: Path | None, po
 
 def georegister_stage(workspace: Workspace, config: RunConfig) -> str:
     """Turn the model to z up, in metres, in ENU where GPS is known."""
-    from app.georegister.stage import georegister
+    from app.georegister.georegister import georegister
 
+    inventory = Inventory.read(workspace.inventory_file)
     model_product = finished_product(workspace.root / "sfm", "sfm")
     inventory_product = finished_product(workspace.root / "capture", "capture")
     return run_stage(
@@ -117,9 +105,9 @@ def georegister_stage(workspace: Workspace, config: RunConfig) -> str:
         options=config.georegister,
         inputs={"model": model_product, "images": inventory_product},
         work=lambda partial: georegister(
-            workspace.sfm_model, Inventory.read(workspace.inventory_file), partial, options=config.georegister
+            workspace.sfm_model, inventory, partial, options=config.georegister, rig_file=inventory.rig_file
         ),
-        product=lambda folder: digest_files([folder]),
+        product=lambda folder: digest_files([folder / "model", folder / "georeference.json"]),
     )
 
 
@@ -134,10 +122,7 @@ def cluster_stage(workspace: Workspace, config: RunConfig) -> str:
         options=config.clustering,
         inputs={"model": model_product},
         work=lambda partial: cluster(
-            workspace.georegistered_model,
-            partial,
-            options=config.clustering,
-            units_per_m=georeference.units_per_m,
+            workspace.georegistered_model, partial, options=config.clustering, units_per_m=georeference.units_per_m
         ),
         product=lambda folder: digest_files([folder / "clusters.jsonl"]),
     )

@@ -235,7 +235,7 @@ def _find_up(scene: PosedScene, frames: ModelFrames, gps: _Gps | None, options: 
         up, sigma_deg, source = _add_heights(frames, gps, term, up, sigma_deg, source, options)
     # Once more with the better up direction, for the height of the cameras.
     refined = find_ground(scene, up, seed=options.seed) if ground is not None else None
-    return _Up(direction=up, sigma_deg=sigma_deg, source=source, ground=refined)
+    return _Up(direction=up, sigma_deg=sigma_deg, source=source, ground=refined if refined is not None else ground)
 
 
 def _up_from_gps_alone(
