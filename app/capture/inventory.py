@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from app.errors import InputError
@@ -77,12 +77,13 @@ class Inventory:
 
     def write(self, path: Path) -> None:
         """Write as JSON."""
-        data = asdict(self)
+        data = vars(self) | {
+            "cameras": [vars(camera) for camera in self.cameras],
+            "frames": [vars(frame) | {"gps": _gps_to_json(frame.gps)} for frame in self.frames],
+            "images": [vars(image) for image in self.images],
+        }
         if self.image_root.is_relative_to(path.parent.absolute()):
             data["image_root"] = self.image_root.relative_to(path.parent.absolute())
-        for frame in data["frames"]:
-            if frame["gps"] and math.isnan(frame["gps"][2]):
-                frame["gps"] = (*frame["gps"][:2], None)
         path.write_text(json.dumps(data, indent=1, default=str, allow_nan=False) + "\n", encoding="utf-8")
 
     @classmethod
@@ -115,6 +116,10 @@ class Inventory:
             )
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(f"cannot read the inventory {path}: {error}; run the capture stage again") from error
+
+
+def _gps_to_json(gps: tuple[float, float, float] | None) -> tuple[float | None, ...] | None:
+    return gps if gps is None else tuple(None if math.isnan(value) else value for value in gps)
 
 
 def _gps_from_json(gps: list[float | None] | None) -> tuple[float, float, float] | None:

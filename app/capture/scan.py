@@ -41,7 +41,9 @@ def camera_of(image_name: str) -> str:
 
 def stem_of(image_name: str) -> str:
     """File name without folder and suffix."""
-    return PurePosixPath(image_name).stem
+    file = image_name.rpartition("/")[2]
+    dot = file.rfind(".")
+    return file[:dot] if dot > 0 else file
 
 
 def scan(root: Path, *, exclude: Sequence[Path] = ()) -> Listing:
