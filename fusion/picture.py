@@ -18,7 +18,7 @@ Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 
 _SUPERSAMPLING = 2
-_MAX_SPLAT_PX = 9
+_MAX_SPLAT_PX = 13
 _FILL_ROUNDS = 2
 _FIELD_OF_VIEW = 0.6
 _FIT_SAMPLES, _OUTLIERS_PERCENT = 200_000, 0.5
@@ -109,12 +109,18 @@ def fit_projection(points: NDArray[np.float32], view: View, options: PictureOpti
 
 
 def _spacing_m(points: NDArray[np.float32]) -> float:
-    """Typical distance between neighbours: from the area that a coarse grid finds occupied."""
-    low, high = np.percentile(points[:: max(1, len(points) // _FIT_SAMPLES)], [1, 99], axis=0)
-    voxel = max(float(np.linalg.norm(high - low)) / 300, 1e-6)
-    cells = np.floor((points - low) / voxel).astype(np.int64)
-    keys = (cells[:, 0] * 73856093) ^ (cells[:, 1] * 19349663) ^ (cells[:, 2] * 83492791)
-    return voxel * float(np.sqrt(len(np.unique(keys)) / len(points)))
+    """Typical distance between neighbours: from the area of voxels that hold several points each."""
+    step = max(1, len(points) // _FIT_SAMPLES)
+    samples = points[::step].astype(np.float64)
+    low, high = np.percentile(samples, [1, 99], axis=0)
+    extent = max(float(np.linalg.norm(high - low)), 1e-6)
+    voxel = extent / 500
+    while True:
+        cells = np.floor((samples - low) / voxel).astype(np.int64)
+        occupied = len(np.unique((cells[:, 0] * 73856093) ^ (cells[:, 1] * 19349663) ^ (cells[:, 2] * 83492791)))
+        if len(samples) >= 6 * occupied or voxel > extent / 8:
+            return voxel * float(np.sqrt(occupied / len(points)))
+        voxel *= 1.4
 
 
 def splat(

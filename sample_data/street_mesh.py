@@ -14,6 +14,9 @@ Floats = NDArray[np.float64]
 CURB_HEIGHT_M = 0.12
 _GROUND_CELL_M = 1.0
 _GROUND_REACH_M = 250.0
+_BOX_CORNERS = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))])
+_BOX_QUADS = np.array([[0, 1, 5, 4], [2, 3, 7, 6], [3, 0, 4, 7], [1, 2, 6, 5], [4, 5, 6, 7]])
+_FANS = np.array([[0, 1, 2], [0, 2, 3]])
 
 
 @dataclass(frozen=True)
@@ -87,12 +90,11 @@ class MeshBuilder:
         self, place: Placement, low: tuple[float, float, float], high: tuple[float, float, float], surface: int
     ) -> None:
         """Add a box without its underside; sides have level, upright surface coordinates."""
-        (x0, y0, z0), (x1, y1, z1) = low, high
-        self.polygon(place, [(x0, y0, z0), (x1, y0, z0), (x1, y0, z1), (x0, y0, z1)], surface)
-        self.polygon(place, [(x1, y1, z0), (x0, y1, z0), (x0, y1, z1), (x1, y1, z1)], surface)
-        self.polygon(place, [(x0, y1, z0), (x0, y0, z0), (x0, y0, z1), (x0, y1, z1)], surface)
-        self.polygon(place, [(x1, y0, z0), (x1, y1, z0), (x1, y1, z1), (x1, y0, z1)], surface)
-        self.polygon(place, [(x0, y0, z1), (x1, y0, z1), (x1, y1, z1), (x0, y1, z1)], surface)
+        corner = np.where(_BOX_CORNERS > 0, high, low)[_BOX_QUADS].reshape(-1, 3)
+        x, y, z = corner.reshape(5, 4, 3).transpose(2, 0, 1)
+        uv = np.stack([np.stack([x[0], -x[1], -y[2], y[3], x[4]]), np.stack([*z[:4], y[4]])], axis=2)
+        quads = place.to_world(corner).reshape(5, 4, 3)
+        self.triangles(quads[:, _FANS].reshape(-1, 3, 3), uv[:, _FANS].reshape(-1, 3, 2), surface)
 
     def prism(
         self,

@@ -120,10 +120,14 @@ class RoadField:
         best = np.full(len(xy), np.inf)
         values = np.zeros((len(xy), 4), dtype=np.float32)
         for road in plan.roads:
-            for start in range(0, len(xy), 20_000):
-                part = slice(start, start + 20_000)
+            for start in range(0, len(xy), 4_000):
+                part = slice(start, start + 4_000)
                 chunk = xy[part]
-                squared = ((chunk[:, None, :] - road.axis.points[None, ::2]) ** 2).sum(axis=2)
+                squared, square_y = (
+                    np.square((chunk[:, axis, None] - road.axis.points[None, ::2, axis]).astype(np.float32))
+                    for axis in (0, 1)
+                )
+                squared += square_y
                 nearest = 2 * squared.argmin(axis=1)
                 heading = road.axis.headings[nearest]
                 offset = chunk - road.axis.points[nearest]
