@@ -35,7 +35,9 @@ ImagesArgument = Annotated[
 ]
 GpsOption = Annotated[
     Path | None,
-    typer.Option("--gps", metavar="FILE", help="CSV with name or frame, lat, lon, alt; or TUM/KITTI poses as positions."),
+    typer.Option(
+        "--gps", metavar="FILE", help="CSV with name or frame, lat, lon, alt; or TUM/KITTI poses as positions."
+    ),
 ]
 RigOption = Annotated[
     Path | None, typer.Option("--rig", metavar="FILE", help="Calibration of the cameras: COLMAP's rig_config.json.")
@@ -153,7 +155,8 @@ def densify(run: Run, allow_partial: PartialOption = False, dry_run: DryRunOptio
 def fuse(
     run: Run,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="OUT.ply", help="Point cloud to write. Default: WORKSPACE/cloud.ply.")
+        Path | None,
+        typer.Option("--out", metavar="OUT.ply", help="Point cloud to write. Default: WORKSPACE/cloud.ply."),
     ] = None,
     allow_partial: PartialOption = False,
 ) -> None:

@@ -7,9 +7,9 @@ import inspect
 import logging
 import sys
 import time
+import types
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Concatenate, ParamSpec
 
@@ -177,7 +177,7 @@ def _settings(arguments: dict[str, Any], sections: tuple[str, ...]) -> dict[str,
 
 
 def _options_class(section: str) -> type:
-    return next(f.default_factory for f in fields(RunConfig) if f.name == section)  # type: ignore[return-value]
+    return next(f.default_factory for f in fields(RunConfig) if f.name == section)  
 
 
 def _flags(section: str) -> list[inspect.Parameter]:
@@ -199,9 +199,7 @@ def _flags(section: str) -> list[inspect.Parameter]:
 def _flag_type(kind: Any) -> Any:
     """The type that Typer is to parse for an option's field."""
     if getattr(kind, "__origin__", None) is tuple and kind.__args__[-1] is Ellipsis:
-        return list[kind.__args__[0]] | None  # type: ignore[name-defined]
-    if isinstance(kind, type) and issubclass(kind, StrEnum):
-        return kind | None
+        kind = types.GenericAlias(list, kind.__args__[:1])
     return kind | None
 
 

@@ -11,7 +11,6 @@ import types
 import typing
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -113,14 +112,12 @@ def format_config(config: RunConfig) -> str:
     return "\n".join(lines)
 
 
-@cache
 def option_types(options: type) -> dict[str, Any]:
     """Type of each field of an options class."""
     hints = typing.get_type_hints(options)
     return {f.name: hints[f.name] for f in fields(options)}
 
 
-@cache
 def option_docs(options: type) -> dict[str, str]:
     """Docstring of each field of an options class, on one line."""
     body = typing.cast(ast.ClassDef, ast.parse(textwrap.dedent(inspect.getsource(options))).body[0]).body

@@ -24,7 +24,6 @@ from fusion.region import GroundRegion
 from mvs_backends.base import MvsJob, MvsView
 from mvs_backends.source_views import choose_source_views
 
-
 _MAX_SOURCES = 20
 """Per reference view, best first; a back-end takes as many of them as it wants."""
 
@@ -167,7 +166,7 @@ def _undistort_image(
     if bitmap is None:
         raise CityReconError(f"cannot read {source}; restore it and run the command again")
     undistorted, _ = pycolmap.undistort_image(options, bitmap, camera)
-    _write_image(target, cv2.cvtColor(undistorted.to_array(), cv2.COLOR_RGB2BGR))
+    _write_image(target, np.asarray(cv2.cvtColor(undistorted.to_array(), cv2.COLOR_RGB2BGR), dtype=np.uint8))
 
 
 def _undistort_mask(
@@ -179,7 +178,7 @@ def _undistort_mask(
     if mask is None:
         raise CityReconError(f"cannot read mask {source}; restore it and run the command again")
     undistorted, _ = pycolmap.undistort_image(options, mask, camera)
-    _write_image(target, np.where(undistorted.to_array() > 254, 255, 0).astype(np.uint8))
+    _write_image(target, np.asarray(np.where(undistorted.to_array() > 254, 255, 0), dtype=np.uint8))
 
 
 def _write_image(path: Path, pixels: NDArray[np.uint8]) -> None:
@@ -246,5 +245,7 @@ def _write_stereo_folder(job: MvsJob) -> None:
             path.parent.mkdir(parents=True, exist_ok=True)
     names = [view.name for view in job.views]
     (stereo / "fusion.cfg").write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
-    lines = [f"{name}\n{', '.join(names[s] for s in sources)}\n" for name, sources in zip(names, job.sources, strict=True)]
+    lines = [
+        f"{name}\n{', '.join(names[s] for s in sources)}\n" for name, sources in zip(names, job.sources, strict=True)
+    ]
     (stereo / "patch-match.cfg").write_text("".join(lines), encoding="utf-8")

@@ -201,7 +201,9 @@ def fuse_stage(
         CityReconError: no job left a point.
     """
     unfinished = {
-        name: "it has no depth maps; run `cityrecon densify` first" for name in jobs if StageRecord.read(dense / name) is None
+        name: "it has no depth maps; run `cityrecon densify` first"
+        for name in jobs
+        if StageRecord.read(dense / name) is None
     }
     tasks = {
         name: Task(

@@ -10,6 +10,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from app.executor import available_cores
+from fusion.errors import FusionError
+from fusion.open3d_import import import_open3d
 from mvs_backends import BACKEND_NAMES, get_backend
 
 _PACKAGES = (
@@ -20,9 +22,6 @@ _PACKAGES = (
     ("pycolmap", "pycolmap"),
     ("trimesh", "trimesh"),
     ("open3d", "open3d"),
-)
-_OPEN3D_HELP = (
-    "only `compare` needs it; on Debian and Ubuntu: apt-get install libegl1 libgl1 libx11-6 libusb-1.0-0 libudev1 libidn2-0"
 )
 
 
@@ -54,8 +53,10 @@ def _version(distribution: str) -> str:
 
 def _import_problem(module: str) -> str | None:
     try:
-        importlib.import_module(module)
-    except (ImportError, OSError) as error:
-        problem = f"cannot be loaded: {error}"
-        return f"{problem}; {_OPEN3D_HELP}" if module == "open3d" else problem
+        if module == "open3d":
+            import_open3d()
+        else:
+            importlib.import_module(module)
+    except (ImportError, OSError, FusionError) as error:
+        return str(error)
     return None

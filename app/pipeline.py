@@ -16,6 +16,7 @@ from app.comparison import compare_files
 from app.dense_stages import batch_jobs, check_backend, cluster_jobs, densify_stage, densify_work, fuse_stage
 from app.errors import CityReconError, InputError
 from app.log import format_seconds
+from app.stage import RECORD, StageRecord
 from app.stages import (
     CaptureSources,
     capture_stage,
@@ -24,7 +25,6 @@ from app.stages import (
     select_stage,
     sfm_stage,
 )
-from app.stage import RECORD, StageRecord
 
 logger = logging.getLogger(__name__)
 
@@ -100,7 +100,9 @@ def plan_full(run: Run, sources: CaptureSources, *, out: Path) -> None:
     logger.info("%s", describe(inventory))
     for stage in ("capture", "sfm", "georegister", "clusters", "selection"):
         record = StageRecord.read(run.workspace.root / stage)
-        state = "to do" if record is None else f"done before in {format_seconds(record.seconds)}, kept if nothing changed"
+        state = (
+            "to do" if record is None else f"done before in {format_seconds(record.seconds)}, kept if nothing changed"
+        )
         logger.info("%-12s %s", stage, state)
     done = len(list((run.workspace.root / "dense").glob(f"*/{RECORD}")))
     logger.info("%-12s %s", "dense", f"{done} clusters done before" if done else "to do")

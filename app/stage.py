@@ -54,7 +54,9 @@ class StageRecord:
             logger.warning("%s is unreadable (%s); doing that stage again", folder / RECORD, error)
             return None
         if data.get("format_version", 0) > FORMAT_VERSION:
-            raise InputError(f"{folder} was made by a newer cityrecon; update the program or choose another --workspace")
+            raise InputError(
+                f"{folder} was made by a newer cityrecon; update the program or choose another --workspace"
+            )
         try:
             return cls(**data)
         except TypeError:
@@ -95,7 +97,7 @@ def run_stage(
     *,
     options: object,
     inputs: Mapping[str, str],
-    work: Callable[[Path], None],
+    work: Callable[[Path], object],
     product: Callable[[Path], str],
 ) -> str:
     """Make ``folder`` by ``work`` unless it is there, made from the same inputs with the same options.
@@ -177,5 +179,9 @@ def _difference(record: StageRecord, options: dict[str, Any], inputs: Mapping[st
         for key in sorted(options.keys() | record.options.keys())
         if options.get(key) != record.options.get(key)
     ]
-    changed += [f"changed {key}" for key in sorted(inputs.keys() | record.inputs.keys()) if inputs.get(key) != record.inputs.get(key)]
+    changed += [
+        f"changed {key}"
+        for key in sorted(inputs.keys() | record.inputs.keys())
+        if inputs.get(key) != record.inputs.get(key)
+    ]
     return ", ".join(changed) or "a new format"

@@ -60,7 +60,9 @@ def capture_stage(workspace: Workspace, sources: CaptureSources, config: RunConf
             )
         },
         work=work,
-        product=lambda folder: digest(replace(Inventory.read(folder / "inventory.json"), image_root=Path(), mask_root=None)),
+        product=lambda folder: digest(
+            replace(Inventory.read(folder / "inventory.json"), image_root=Path(), mask_root=None)
+        ),
     )
     logger.info("%s", describe(Inventory.read(workspace.inventory_file)))
     return product
@@ -147,8 +149,10 @@ def select_stage(workspace: Workspace, config: RunConfig, *, num_jobs: int) -> s
         ),
         product=lambda folder: digest_files([folder / "selection.jsonl"]),
     )
+
+
 def _listing_digest(path: Path | None) -> str:
-    """Hash of the names, sizes and times of a file or of all files in a folder: cheap, and a false alarm costs little."""
+    """Hash of the names, sizes and times of a file or of all files in a folder: a false alarm costs little."""
     if path is None:
         return "none"
     files = [path]

@@ -82,15 +82,19 @@ class Workspace:
             CityReconError: another run holds it.
         """
         try:
-            self.root.mkdir(parents=True, exist_ok=True)
+            self.root.mkdir(exist_ok=True)
             handle = os.open(self.root / ".lock", os.O_RDWR | os.O_CREAT, 0o666)
         except OSError as error:
-            raise InputError(f"cannot write workspace {self.root}: {error.strerror}; choose another with --workspace") from error
+            raise InputError(
+                f"cannot write workspace {self.root}: {error.strerror}; create its parent folder or choose another"
+            ) from error
         try:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
-                raise CityReconError(f"another run is using workspace {self.root}; wait for it or choose another with --workspace") from error
+                raise CityReconError(
+                    f"another run is using workspace {self.root}; wait for it or choose another workspace"
+                ) from error
             yield
         finally:
             os.close(handle)

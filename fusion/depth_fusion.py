@@ -58,9 +58,7 @@ def fuse_depth_maps(
     fusion.max_normal_error = options.max_normal_error_deg
     fusion.bounding_box = (bounds[0], bounds[1])
     try:
-        pycolmap.stereo_fusion(
-            str(output), str(workspace), input_type="geometric", options=fusion, output_type="PLY"
-        )
+        pycolmap.stereo_fusion(str(output), str(workspace), input_type="geometric", options=fusion, output_type="PLY")
     except (ValueError, RuntimeError) as error:
         raise FusionError(f"{workspace}: stereo fusion failed: {error}") from error
     return read_ply(output)

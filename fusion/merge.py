@@ -14,9 +14,7 @@ def crop_cloud(cloud: PointCloud, region: GroundRegion) -> PointCloud:
     return cloud.select(region.contains(cloud.points))
 
 
-def merge_clouds(
-    clouds: Sequence[Path], output: Path, *, progress: Callable[[int, int], None] | None = None
-) -> int:
+def merge_clouds(clouds: Sequence[Path], output: Path, *, progress: Callable[[int, int], None] | None = None) -> int:
     """Write several clouds, all with normals and colours, into one PLY file, a piece at a time.
 
     Returns:

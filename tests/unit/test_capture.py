@@ -187,6 +187,8 @@ def test_workspace_and_masks_inside_the_folder_are_not_images(tmp_path: Path) ->
         mask_dir=tmp_path / "images" / "masks",
     )
     assert len(inventory.images) == 8
+    with_masks = capture(tmp_path / "images", tmp_path / "images" / "ws" / "capture", options=OPTIONS)
+    assert {camera.name for camera in with_masks.cameras} == {"cam0", "cam1", "masks/cam0", "masks/cam1"}
     assert {image.name for image in inventory.images if image.has_mask} == {"cam0/000.png", "cam1/003.png"}
     assert "masks: 2 of 8 images" in describe(inventory)
     with pytest.raises(InputError, match="is the image folder itself"):

@@ -58,7 +58,8 @@ from pathlib import Path
 from app.executor import run_jobs
 from tests.unit.test_executor import wait_forever
 if __name__ == "__main__":
-    run_jobs(wait_forever, {{"a": (Path({str(tmp_path / "pid")!r}),)}}, num_workers=1, log_file=Path({str(tmp_path / "log")!r}),
+    folder = Path({str(tmp_path)!r})
+    run_jobs(wait_forever, {{"a": (folder / "pid",)}}, num_workers=1, log_file=folder / "log",
              on_progress=print, on_done=print)
 """
     main = tmp_path / "main.py"

@@ -14,7 +14,17 @@ from app.capture.inventory import Inventory
 from app.errors import InputError
 from app.georegister.georeference import Georeference, GravitySource, ScaleSource
 from app.georegister.georegister import GeoregisterOptions, georegister
-from tests.street_model import HEIGHT_M, ORIGIN, Drive, drive, inventory, random_similarity, write_model
+from app.georegister.gravity import up_from_cameras
+from tests.street_model import (
+    HEIGHT_M,
+    ORIGIN,
+    Drive,
+    drive,
+    inventory,
+    on_a_slope,
+    random_similarity,
+    write_model,
+)
 
 
 def run(
@@ -129,8 +139,8 @@ def test_missing_images_do_not_move_frames(tmp_path: Path) -> None:
     truth = drive()
     write_model(truth, tmp_path / "whole", random_similarity(1))
     model = pycolmap.Reconstruction(tmp_path / "whole")
-    for frame in range(0, 20, 3):
-        model.deregister_frame(model.find_image_with_name(f"cam0/{frame:06d}.jpg").frame_id)
+    for frame in range(20):
+        model.deregister_frame(model.find_image_with_name(f"cam{frame % 3}/{frame:06d}.jpg").frame_id)
     (tmp_path / "part").mkdir()
     model.write_binary(tmp_path / "part")
     found = georegister(
@@ -159,6 +169,32 @@ def test_gravity_from_cameras_and_ground(
     assert np.median(spacing) == pytest.approx(1.0)
     assert np.allclose(centers[0][:2], 0.0, atol=1e-9)
     assert centers[0][2] == pytest.approx(HEIGHT_M / 1.5, rel=0.03)
+
+
+def test_cameras_that_look_around_tell_up_without_the_ground() -> None:
+    """All look 10 degrees down; what is horizontal are their x axes."""
+    truth = drive(pitch_deg=10.0)
+    found = up_from_cameras(truth.rotations.reshape(-1, 3, 3), np.tile(np.arange(3), 20))
+    assert found is not None
+    assert np.degrees(np.arccos(found[0][2])) < 0.7
+
+
+def test_the_ground_tells_the_pitch_of_a_single_camera(tmp_path: Path) -> None:
+    truth = drive(40, corner=False, pitch_deg=10.0)
+    write_model(truth, tmp_path / "sfm", random_similarity(3), cameras=(0,))
+    found = georegister(tmp_path / "sfm", None, tmp_path / "out", options=GeoregisterOptions())
+    assert found.gravity_source is GravitySource.CAMERAS_AND_GROUND
+    assert tilt_deg(truth, pycolmap.Reconstruction(tmp_path / "out" / "model")) < 1.0
+
+
+def test_gps_heights_tell_a_slope_from_a_tilt(tmp_path: Path) -> None:
+    """Cameras and ground both lean with the road."""
+    truth = on_a_slope(drive(), 6.0)
+    found, model = run(tmp_path, truth, inventory(truth))
+    assert tilt_deg(truth, model) == pytest.approx(6.0, abs=0.7)
+    found, model = run(tmp_path, truth, inventory(truth, gps_m=noisy(truth, 0.05)))
+    assert tilt_deg(truth, model) < 0.7
+    assert found.gravity_source in (GravitySource.GPS, GravitySource.GPS_AND_CAMERAS)
 
 
 def test_without_an_inventory(tmp_path: Path) -> None:

@@ -1,0 +1,206 @@
+"""The embedded back-end on planes whose depth is known."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from numpy.typing import NDArray
+
+from mvs_backends import BACKEND_NAMES, get_backend
+from mvs_backends.base import MvsError, MvsJob, MvsOptions, Preset
+from mvs_backends.patchmatch.backend import estimate_maps
+from mvs_backends.patchmatch.options import PatchMatchOptions
+from tests.reference.plane_scene import plane_job, true_depth
+
+OPTIONS = MvsOptions()
+SLANTED = (0.35, -0.3, 1.0)
+QUICK = PatchMatchOptions(num_source_views=3, max_cost_views=3, iterations=(3, 1), prior_iterations=1, num_random=4)
+
+
+def run(job: MvsJob, *, num_threads: int = 2, options: MvsOptions = OPTIONS) -> list[tuple[NDArray, NDArray]]:
+    get_backend("patchmatch").estimate(job=job, options=options, num_threads=num_threads)
+    return maps(job)
+
+
+def maps(job: MvsJob) -> list[tuple[NDArray, NDArray]]:
+    found = []
+    for view in range(len(job.views)):
+        depth, normal = pycolmap.DepthMap(), pycolmap.NormalMap()
+        depth.read(job.depth_map_path(view))
+        normal.read(job.normal_map_path(view))
+        found.append((depth.to_array(), normal.to_array()))
+    return found
+
+
+def map_bytes(job: MvsJob) -> list[bytes]:
+    return [
+        path.read_bytes() for v in range(len(job.views)) for path in (job.depth_map_path(v), job.normal_map_path(v))
+    ]
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), SLANTED], ids=["fronto-parallel", "slanted"])
+def test_depth_and_normal_of_a_textured_plane(tmp_path: Path, normal: tuple[float, float, float]) -> None:
+    job = plane_job(tmp_path, normal=normal)
+    direction = np.asarray(normal) / np.linalg.norm(normal)
+    for view, (depth, normals) in zip(job.views, run(job), strict=True):
+        known = depth > 0
+        assert known.mean() > 0.85
+        error = np.abs(depth / true_depth(view, direction, 5.0) - 1)[known]
+        assert np.mean(error < 0.005) >= 0.95
+        towards_camera = -view.cam_from_world[:, :3] @ direction
+        angle = np.degrees(np.arccos(np.clip(normals[known] @ towards_camera, -1, 1)))
+        assert np.median(angle) < 2.0
+        assert np.mean(angle < 8.0) > 0.95
+        np.testing.assert_allclose(np.linalg.norm(normals[known], axis=-1), 1.0, atol=1e-4)
+        assert not normals[~known].any()
+
+
+def test_scaling_the_scene_scales_the_depth(tmp_path: Path) -> None:
+    one = run(plane_job(tmp_path / "one", normal=SLANTED))
+    # A power of two, so that all numbers keep their digits.
+    eight = run(plane_job(tmp_path / "eight", normal=SLANTED, scale=8.0))
+    for (depth, _), (scaled, _) in zip(one, eight, strict=True):
+        np.testing.assert_array_equal(depth > 0, scaled > 0)
+        np.testing.assert_allclose(scaled, 8 * depth, rtol=1e-5)
+
+
+def test_order_of_source_views_does_not_matter(tmp_path: Path) -> None:
+    job = plane_job(tmp_path / "a", normal=SLANTED)
+    turned = dataclasses.replace(plane_job(tmp_path / "b", normal=SLANTED), sources=tuple(s[::-1] for s in job.sources))
+    run(job)
+    run(turned)
+    assert map_bytes(job) == map_bytes(turned)
+
+
+def test_same_bytes_for_any_number_of_threads(tmp_path: Path) -> None:
+    one, two = (plane_job(tmp_path / name, normal=SLANTED) for name in ("one", "two"))
+    run(one, num_threads=1)
+    run(two, num_threads=2)
+    assert map_bytes(one) == map_bytes(two)
+
+
+def test_seed_changes_the_search_and_not_the_surface(tmp_path: Path) -> None:
+    one, two = (plane_job(tmp_path / name, normal=SLANTED) for name in ("one", "two"))
+    first, second = run(one), run(two, options=MvsOptions(seed=5))
+    assert map_bytes(one) != map_bytes(two)
+    both = (first[1][0] > 0) & (second[1][0] > 0)
+    assert np.median(np.abs(first[1][0] / second[1][0] - 1)[both]) < 0.002
+
+
+class _StoppedError(Exception):
+    pass
+
+
+@pytest.mark.parametrize("stop_after", [1, 3, 4])
+def test_stopped_job_continues_to_the_same_bytes(tmp_path: Path, stop_after: int) -> None:
+    whole, stopped = (plane_job(tmp_path / name, normal=SLANTED, num_views=3) for name in ("whole", "stopped"))
+    estimate_maps(job=whole, options=QUICK, seed=0, num_threads=1)
+    calls = 0
+
+    def stop(done: int, total: int) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == stop_after:
+            raise _StoppedError
+
+    with pytest.raises(_StoppedError):
+        estimate_maps(job=stopped, options=QUICK, seed=0, num_threads=1, progress=stop)
+    kept = {path: path.stat().st_mtime_ns for path in (stopped.workspace / "stereo").rglob("*view*")}
+    assert kept
+    estimate_maps(job=stopped, options=QUICK, seed=0, num_threads=1)
+    assert map_bytes(whole) == map_bytes(stopped)
+    assert not list((stopped.workspace / "stereo").rglob("*view*"))
+
+
+def test_other_options_do_not_reuse_kept_passes(tmp_path: Path) -> None:
+    fresh, changed = (plane_job(tmp_path / name, normal=SLANTED, num_views=3) for name in ("fresh", "changed"))
+
+    def stop(done: int, total: int) -> None:
+        raise _StoppedError
+
+    with pytest.raises(_StoppedError):
+        estimate_maps(job=changed, options=QUICK, seed=1, num_threads=1, progress=stop)
+    estimate_maps(job=changed, options=QUICK, seed=0, num_threads=1)
+    estimate_maps(job=fresh, options=QUICK, seed=0, num_threads=1)
+    assert map_bytes(fresh) == map_bytes(changed)
+
+
+def test_masked_pixels_and_rays_beside_the_region_get_no_depth(tmp_path: Path) -> None:
+    job = plane_job(tmp_path, normal=(0.0, 0.0, 1.0), num_views=3)
+    mask = np.full((80, 112), 255, np.uint8)
+    mask[:30, :40] = 0
+    (tmp_path / "masks" / "cam").mkdir(parents=True)
+    cv2.imwrite(str(tmp_path / "masks" / f"{job.views[1].name}.png"), mask)
+    half = np.array([[[0.0, -8.0, 2.0], [8.0, 8.0, 12.0]]])
+    job = dataclasses.replace(job, mask_dir=tmp_path / "masks", boxes_in_world=half)
+    estimate_maps(job=job, options=QUICK, seed=0, num_threads=1)
+    depths = [depth for depth, _ in maps(job)]
+    assert not depths[1][:30, :40].any()
+    # The middle camera looks along z from x = 0: its left half sees x < 0 only.
+    assert not depths[1][:, :55].any()
+    assert (depths[1][:, 60:] > 0).mean() > 0.8
+
+
+def test_colmap_fuses_the_maps(tmp_path: Path) -> None:
+    job = plane_job(tmp_path, normal=SLANTED)
+    run(job)
+    model = pycolmap.Reconstruction()
+    for i, view in enumerate(job.views, start=1):
+        params = [view.calibration[0, 0], view.calibration[1, 1], view.calibration[0, 2], view.calibration[1, 2]]
+        camera = pycolmap.Camera(camera_id=i, model="PINHOLE", width=view.width, height=view.height, params=params)
+        model.add_camera_with_trivial_rig(camera)
+        image = pycolmap.Image(image_id=i, camera_id=i, name=view.name)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(view.cam_from_world))
+    (tmp_path / "sparse").mkdir()
+    model.write(tmp_path / "sparse")
+    (tmp_path / "stereo" / "fusion.cfg").write_text("".join(f"{view.name}\n" for view in job.views))
+    options = pycolmap.StereoFusionOptions(min_num_pixels=3)
+    fused = pycolmap.stereo_fusion(
+        output_path=tmp_path / "fused.ply", workspace_path=tmp_path, options=options, output_type="ply"
+    )
+    points = np.array([point.xyz for point in fused.points3D.values()])
+    assert len(points) > 2000
+    direction = np.asarray(SLANTED) / np.linalg.norm(SLANTED)
+    assert np.percentile(np.abs(points @ direction - 5.0), 90) < 0.02
+
+
+def test_view_without_sources_gets_an_empty_map(tmp_path: Path) -> None:
+    job = plane_job(tmp_path, normal=SLANTED, num_views=3)
+    job = dataclasses.replace(job, sources=((), (2,), (1,)))
+    estimate_maps(job=job, options=QUICK, seed=0, num_threads=1)
+    depths = [depth for depth, _ in maps(job)]
+    assert not depths[0].any()
+    assert depths[1].any()
+
+
+def test_unreadable_image_is_named(tmp_path: Path) -> None:
+    job = plane_job(tmp_path, normal=SLANTED, num_views=3)
+    job.image_path(1).write_bytes(b"not an image")
+    with pytest.raises(MvsError, match="001.png"):
+        estimate_maps(job=job, options=QUICK, seed=0, num_threads=1)
+
+
+def test_unknown_backend_lists_the_valid_ones() -> None:
+    with pytest.raises(ValueError, match=", ".join(BACKEND_NAMES)):
+        get_backend("nonsense")
+    assert get_backend("patchmatch").availability().ok
+
+
+@pytest.mark.parametrize("preset", list(Preset))
+def test_every_preset_fills_whole_size_maps(tmp_path: Path, preset: Preset) -> None:
+    job = plane_job(tmp_path, normal=(0.0, 0.0, 1.0), num_views=3)
+    for depth, normal in run(job, options=MvsOptions(preset=preset)):
+        assert depth.shape == (80, 112)
+        assert normal.shape == (80, 112, 3)
+        assert (depth > 0).mean() > 0.7
+
+
+@pytest.mark.parametrize("field", ["num_source_views", "max_cost", "sigma_grey", "iterations"])
+def test_invalid_options_name_the_field(field: str) -> None:
+    with pytest.raises(ValueError, match=field):
+        dataclasses.replace(PatchMatchOptions(), **{field: () if field == "iterations" else 0})
