@@ -66,7 +66,17 @@ def drive(
     return Drive(rotations=rotations, centers_m=centers, points_m=np.vstack((ground, walls)))
 
 
-def write_model(truth: Drive, folder: Path, model_from_world: pycolmap.Sim3d | None = None) -> None:
+def on_a_slope(truth: Drive, slope_deg: float) -> Drive:
+    """The same drive up a road that climbs along x; its first point stays."""
+    climb = _about_y(-np.radians(slope_deg))
+    return Drive(
+        rotations=truth.rotations @ climb.T, centers_m=truth.centers_m @ climb.T, points_m=truth.points_m @ climb.T
+    )
+
+
+def write_model(
+    truth: Drive, folder: Path, model_from_world: pycolmap.Sim3d | None = None, cameras: tuple[int, ...] = (0, 1, 2)
+) -> None:
     """Write the drive as a COLMAP model, moved, turned and scaled by a similarity."""
     model = pycolmap.Reconstruction()
     for camera in range(3):
@@ -75,7 +85,7 @@ def write_model(truth: Drive, folder: Path, model_from_world: pycolmap.Sim3d | N
     tracks: list[list[tuple[int, int]]] = [[] for _ in truth.points_m]
     image_id = 0
     for frame in range(len(truth.centers_m)):
-        for camera in range(3):
+        for camera in cameras:
             image_id += 1
             rotation, center = truth.rotations[frame, camera], truth.centers_m[frame, camera]
             seen = (truth.points_m - center) @ rotation.T
