@@ -18,9 +18,9 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mvs_backends.base import Availability, MvsBackend, MvsError, MvsJob, MvsOptions, Progress
-from mvs_backends.patchmatch.geometry import depth_and_normal, level_camera
+from mvs_backends.patchmatch.cost.kernels import PADDING, Reference
+from mvs_backends.patchmatch.geometry import LevelCamera, depth_and_normal, level_camera
 from mvs_backends.patchmatch.images import ImageCache
-from mvs_backends.patchmatch.kernels import PADDING, Reference
 from mvs_backends.patchmatch.options import PatchMatchOptions, options_of_preset
 from mvs_backends.patchmatch.prior import interpolated_planes
 from mvs_backends.patchmatch.search import (
@@ -86,7 +86,7 @@ def estimate_maps(
                     started = time.perf_counter()
                     found = _search_view(job, view, number, options, seed, images, folder, executor)
                     if last:
-                        _write_maps(job, view, found, options)
+                        _write_maps(job, view, _full_size(job, view, found, options, images), options)
                     else:
                         _save(_kept_file(folder, number, view), found)
                     logger.debug(
@@ -116,15 +116,9 @@ def _search_view(
     camera = level_camera(job.views[view], level)
     grey, _ = images.get(view, level)
     limits = inverse_range(job, view, camera, _mask(job, view, camera.width, camera.height))
-    empty = np.zeros((0, 0, 3), np.float32)
-    calibration = camera.calibration
-    reference = Reference(
-        padded_grey=np.pad(grey, PADDING, mode="edge"),
-        inverse_range=limits,
-        intrinsics=np.array([calibration[0, 0], calibration[1, 1], calibration[0, 2], calibration[1, 2]], np.float32),
-        prior=empty,
-    )
-    sources = job.sources[view][: options.num_source_views]
+    reference = _reference(camera, grey, limits)
+    # By index: nothing depends on the order in which a job names them.
+    sources = sorted(job.sources[view][: options.num_source_views])
     if not sources or not (limits[..., 1] > 0).any():
         shape = grey.shape
         return Hypotheses(
@@ -156,11 +150,33 @@ def _search_view(
         found = search.with_prior(found).sweep(
             found, options.prior_iterations, random_depth=False, first_iteration=options.iterations[0]
         )
+    if number == len(options.iterations) - 1 and options.smoothing_radius_px > 0:
+        found = search.smoothed(found, options.smoothing_radius_px)
     return found
 
 
+def _full_size(job: MvsJob, view: int, found: Hypotheses, options: PatchMatchOptions, images: ImageCache) -> Hypotheses:
+    """The last pass' hypotheses at the size of the image."""
+    if options.finest_level == 0:
+        return found
+    camera = level_camera(job.views[view], 0)
+    limits = inverse_range(job, view, camera, _mask(job, view, camera.width, camera.height))
+    reference = _reference(camera, images.get(view, 0)[0], limits)
+    return upsampled(found, images.get(view, options.finest_level)[0], reference)
+
+
+def _reference(camera: LevelCamera, grey: NDArray[np.uint8], limits: NDArray[np.float32]) -> Reference:
+    calibration = camera.calibration
+    return Reference(
+        padded_grey=np.pad(grey, PADDING, mode="edge"),
+        inverse_range=limits,
+        intrinsics=np.array([calibration[0, 0], calibration[1, 1], calibration[0, 2], calibration[1, 2]], np.float32),
+        prior=np.zeros((0, 0, 3), np.float32),
+    )
+
+
 def _level(options: PatchMatchOptions, number: int) -> int:
-    return len(options.iterations) - 1 - number
+    return options.finest_level + len(options.iterations) - 1 - number
 
 
 def _mask(job: MvsJob, view: int, width: int, height: int) -> NDArray[np.bool_] | None:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvs_backends.base import MvsError, MvsJob
+from mvs_backends.patchmatch.cost.kernels import pack_neighbours
 from mvs_backends.patchmatch.geometry import level_size
-from mvs_backends.patchmatch.kernels import pack_neighbours
 
 
 class ImageCache:

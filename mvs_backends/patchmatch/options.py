@@ -17,6 +17,8 @@ class PatchMatchOptions:
     """The cost of a hypothesis is averaged over the best of the source views, at most so many. ACMM: all."""
     iterations: tuple[int, ...] = (6, 3, 2)
     """Sweeps per level, coarse to fine; each level halves the pixel size."""
+    finest_level: int = 0
+    """Halvings of the image at which the search ends; its maps are upsampled."""
     prior_iterations: int = 2
     """Further sweeps at the coarsest level with the planar prior. ACMP: 3. 0: no planar prior."""
     num_random: int = 8
@@ -37,6 +39,8 @@ class PatchMatchOptions:
     """Pixels of at most this cost support the planar prior. ACMP: 0.1."""
     prior_cell_px: int = 5
     """One support pixel per cell of this size. ACMP: 5."""
+    smoothing_radius_px: int = 3
+    """At the end, each plane is averaged with those that agree within so many pixels. 0: no."""
     min_speckle_px: int = 40
     """Smaller connected pieces of a depth map are removed."""
 
@@ -44,7 +48,14 @@ class PatchMatchOptions:
         for field in ("num_source_views", "max_cost_views", "num_random", "prior_cell_px"):
             if getattr(self, field) < 1:
                 raise ValueError(f"{field} must be at least 1, not {getattr(self, field)}")
-        for field in ("prior_iterations", "geometric_weight", "min_angle_deg", "max_prior_cost", "min_speckle_px"):
+        for field in (
+            "prior_iterations",
+            "geometric_weight",
+            "min_angle_deg",
+            "max_prior_cost",
+            "smoothing_radius_px",
+            "min_speckle_px",
+        ):
             if getattr(self, field) < 0:
                 raise ValueError(f"{field} must be at least 0, not {getattr(self, field)}")
         for field in ("max_geometric_error_px", "sigma_space_px", "sigma_grey", "max_cost"):
@@ -55,11 +66,10 @@ class PatchMatchOptions:
 
 
 PRESETS = {
-    Preset.PREVIEW: PatchMatchOptions(num_source_views=4, max_cost_views=3, iterations=(5, 2), prior_iterations=2),
+    Preset.PREVIEW: PatchMatchOptions(num_source_views=4, max_cost_views=3, iterations=(5, 3), finest_level=1),
     Preset.NORMAL: PatchMatchOptions(),
     Preset.HIGH: PatchMatchOptions(num_source_views=9, max_cost_views=6, iterations=(8, 5, 4), prior_iterations=3),
 }
-"""`preview` stops at half the size: its maps are upsampled."""
 
 
 def options_of_preset(options: MvsOptions) -> PatchMatchOptions:

@@ -11,19 +11,11 @@ from numpy.typing import NDArray
 
 from mvs_backends.base import MvsJob
 from mvs_backends.depth_range import depth_range
+from mvs_backends.patchmatch.cost.kernels import Reference, Sources, Window, new_scratch
 from mvs_backends.patchmatch.geometry import LevelCamera, level_camera, warp
 from mvs_backends.patchmatch.images import ImageCache
-from mvs_backends.patchmatch.kernels import (
-    Reference,
-    Search,
-    Sources,
-    State,
-    Window,
-    initialise_rows,
-    new_scratch,
-    sweep_rows,
-    upsample,
-)
+from mvs_backends.patchmatch.kernels import Search, State, initialise_rows, sweep_rows
+from mvs_backends.patchmatch.maps.kernels import smooth_rows, upsample
 from mvs_backends.patchmatch.options import PatchMatchOptions
 from mvs_backends.patchmatch.prior import interpolated_planes, support_points
 
@@ -195,6 +187,18 @@ class LevelSearch:
             for colour in (0, 1):
                 self._over_bands(sweep_rows, colour, state, search)
         return Hypotheses(plane=state.plane, cost=state.cost, view=state.best_view)
+
+    def smoothed(self, found: Hypotheses, radius_px: int) -> Hypotheses:
+        """Hypotheses averaged over those of the neighbourhood that agree."""
+        result = np.empty_like(found.plane)
+
+        def run(first_row: int) -> None:
+            last_row = min(first_row + _ROWS_PER_TASK, len(result))
+            smooth_rows(first_row, last_row, radius_px, found.plane, self.reference, self.sources, result)
+
+        for _ in self.executor.map(run, range(0, len(result), _ROWS_PER_TASK)):
+            pass
+        return Hypotheses(plane=result, cost=found.cost, view=found.view)
 
     def with_prior(self, found: Hypotheses) -> LevelSearch:
         """The same search with a planar prior from the reliable pixels of `found`."""
