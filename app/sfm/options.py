@@ -57,11 +57,11 @@ class SfmOptions:
     """Each frame is matched with this many following frames, in all cameras."""
     sequence_quadratic_window: int = 3
     """And with the frames 2^k beyond the window, k below this number, camera by camera."""
-    num_position_neighbors: int = 12
-    """Each image is matched with this many images nearest in position (GPS or position priors)."""
-    max_position_distance_m: float = 40.0
+    num_position_neighbors: int = 4
+    """Each frame is matched with this many frames that are near (GPS or position priors) but were taken at another time."""
+    max_position_distance_m: float = 20.0
     """But with none farther away than this."""
-    max_exhaustive_images: int = 60
+    max_exhaustive_images: int = 30
     """Sets of up to this many images are matched exhaustively."""
     min_registered_ratio: float = 0.9
     """Strategies are tried in order until this share of the images registers."""

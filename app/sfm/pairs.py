@@ -15,6 +15,8 @@ Pair = tuple[str, str]
 """Image names, the lesser first."""
 
 EARTH_RADIUS_M = 6_371_000.0
+_MIN_DETOUR = 2.0
+"""Frames are near again, rather than still, if the path between them is longer than this times their distance."""
 
 
 def image_pairs(inventory: Inventory, options: SfmOptions) -> list[Pair]:
@@ -55,19 +57,22 @@ def sequence_pairs(frames: tuple[FrameEntry, ...], options: SfmOptions) -> Itera
 
 
 def position_pairs(frames: tuple[FrameEntry, ...], options: SfmOptions) -> Iterator[Pair]:
-    """Pairs of images of frames that are near each other though far apart in the sequence: places visited again.
+    """Pairs of images of frames that are near each other but far apart along the path: places visited again.
 
-    Each frame gets its `num_position_neighbors` nearest frames within `max_position_distance_m` that the sequence
-    doesn't pair with it already, all cameras with all, because a road driven back shows other cameras the same walls.
+    Each frame gets the nearest `num_position_neighbors` of such frames within `max_position_distance_m`, all cameras
+    with all, because a road driven back shows other cameras the same walls.
     """
     positions = frame_positions_m(frames)
     located = np.flatnonzero(np.isfinite(positions).all(axis=1))
-    for index in located:
+    steps = np.linalg.norm(np.diff(positions[located], axis=0), axis=1)
+    path_m = np.concatenate([[0.0], np.cumsum(steps)])
+    for row, index in enumerate(located):
         distances = np.linalg.norm(positions[located] - positions[index], axis=1)
-        near = located[distances <= options.max_position_distance_m]
-        order = np.argsort(distances[distances <= options.max_position_distance_m], kind="stable")
-        fresh = [other for other in near[order] if abs(other - index) > options.sequence_window]
-        for other in fresh[: options.num_position_neighbors]:
+        revisits = np.abs(path_m - path_m[row]) > _MIN_DETOUR * distances
+        beyond_window = np.abs(located - index) > options.sequence_window
+        near = np.flatnonzero(revisits & beyond_window & (distances <= options.max_position_distance_m))
+        nearest = near[np.argsort(distances[near], kind="stable")][: options.num_position_neighbors]
+        for other in located[nearest]:
             yield from product(frames[index].images.values(), frames[other].images.values())
 
 
