@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from ortools.sat.python import cp_model
+from ortools.linear_solver.python import model_builder as mip
 
 from app.view_selection.reduction import CoveringRows
 from app.view_selection.visibility import unpack_rows
 
-_QUALITY_STEPS = 10_000
-"""The solver works on whole numbers: the best view's quality is this many steps."""
+_TOLERANCE = 1e-6
+"""Of the solver; bounds closer than this to a whole number, or relatively to the objective, are that number."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,9 +53,9 @@ class Solution:
     """(N_c,)"""
     size_bound: int
     """No feasible selection has fewer views."""
-    quality: int = 0
-    """Total quality in whole steps; 0 where none was asked for."""
-    quality_bound: int = 0
+    quality: float = 0.0
+    """Total quality; 0 where none was asked for."""
+    quality_bound: float = 0.0
     """No feasible selection of this size has more."""
 
 
@@ -94,15 +95,13 @@ def greedy_selection(program: ViewProgram, preference: NDArray[np.float64]) -> N
     return selected
 
 
-def smallest_selection(program: ViewProgram, preference: NDArray[np.float64], max_time_s: float) -> Solution:
-    """Solve the program of [O]; the greedy selection where the solver finds nothing better in time."""
+def smallest_selection(program: ViewProgram, preference: NDArray[np.float64], max_nodes: int) -> Solution:
+    """Solve the program of [O]; the greedy selection where the solver finds nothing better within its limit."""
     selected = greedy_selection(program, preference)
     bound = max(program.min_views, int(program.fixed.sum()))
     if selected.sum() > bound:
-        model, variables = _model(program, selected)
-        model.minimize(cp_model.LinearExpr.sum(variables))
-        solver, found = _solve(model, variables, max_time_s)
-        bound = max(bound, _whole_bound(solver.best_objective_bound))
+        found, objective_bound = _solve(program, _minimize_size, max_nodes)
+        bound = max(bound, int(np.ceil(objective_bound - _TOLERANCE)))
         if found is not None and found.sum() < selected.sum():
             selected = found
     return Solution(selected=selected, size_bound=bound)
@@ -113,7 +112,7 @@ def best_selection(
     smallest: Solution,
     quality: NDArray[np.float64],
     viewpoint: NDArray[np.int64],
-    max_time_s: float,
+    max_nodes: int,
 ) -> Solution:
     """Among the feasible selections of the smallest size, the one with the best total quality.
 
@@ -123,80 +122,100 @@ def best_selection(
     Args:
         program: What to meet.
         smallest: A selection of the size wanted.
-        quality: (N_c,)
+        quality: (N_c,) at least 0.
         viewpoint: (N_c,) number of each view's viewpoint.
-        max_time_s: Of the solver, deterministic.
+        max_nodes: Limit of the solver.
     """
-    steps = np.round(quality * (_QUALITY_STEPS / max(quality.max(initial=0.0), 1e-300))).astype(np.int64)
-    model, variables = _model(program, smallest.selected)
-    model.add(cp_model.LinearExpr.sum(variables) == int(smallest.selected.sum()))
-    # A view alone at its viewpoint counts itself; of several, one counts.
-    counted = list(variables)
-    for number in np.unique(viewpoint[program.usable]):
-        views = np.flatnonzero((viewpoint == number) & program.usable)
-        if len(views) < 2:
-            continue
-        for view in views.tolist():
-            counted[view] = model.new_bool_var(f"counts_{view}")
-            model.add_implication(counted[view], variables[view])
-        model.add_at_most_one([counted[view] for view in views])
-    model.maximize(cp_model.LinearExpr.weighted_sum(counted, [int(step) for step in steps]))
-    solver, found = _solve(model, variables, max_time_s)
-    selected = smallest.selected if found is None else found
-    total = total_quality(selected, steps, viewpoint)
+    size = int(smallest.selected.sum())
+
+    def maximize_quality(model: mip.Model, variables: list[mip.Variable]) -> None:
+        model.add_linear_constraint(mip.LinearExpr.sum(variables), size, size)
+        model.maximize(mip.LinearExpr.weighted_sum(_counted(model, variables, program, viewpoint), quality.tolist()))
+
+    found, objective_bound = _solve(program, maximize_quality, max_nodes)
+    candidates = [smallest.selected] if found is None else [found, smallest.selected]
+    selected = max(candidates, key=lambda candidate: total_quality(candidate, quality, viewpoint))
+    total = total_quality(selected, quality, viewpoint)
+    proven = objective_bound <= total * (1 + _TOLERANCE)
     return Solution(
         selected=selected,
         size_bound=smallest.size_bound,
         quality=total,
-        quality_bound=max(total, -_whole_bound(-solver.best_objective_bound)),
+        quality_bound=total if proven else objective_bound,
     )
 
 
-def total_quality(selected: NDArray[np.bool_], quality: NDArray[np.int64], viewpoint: NDArray[np.int64]) -> int:
+def total_quality(selected: NDArray[np.bool_], quality: NDArray[np.float64], viewpoint: NDArray[np.int64]) -> float:
     """Sum over viewpoints of the best selected view's quality."""
-    best = np.zeros(int(viewpoint.max(initial=-1)) + 1, dtype=np.int64)
+    best = np.zeros(int(viewpoint.max(initial=-1)) + 1)
     np.maximum.at(best, viewpoint[selected], quality[selected])
-    return int(best.sum())
+    return float(best.sum())
 
 
-def _whole_bound(bound: float) -> int:
-    """The whole number that a proven lower bound of a whole number implies; the solver's bounds are nearly whole."""
-    return int(np.ceil(bound - 1e-6))
+def _minimize_size(model: mip.Model, variables: list[mip.Variable]) -> None:
+    model.minimize(mip.LinearExpr.sum(variables))
 
 
-def _model(program: ViewProgram, hint: NDArray[np.bool_]) -> tuple[cp_model.CpModel, list[cp_model.IntVar]]:
-    """The program's constraints, without an objective."""
-    model = cp_model.CpModel()
-    variables = [model.new_bool_var(f"view_{view}") for view in range(len(hint))]
-    for view, variable in enumerate(variables):
-        model.add_hint(variable, bool(hint[view]))
-        if not program.usable[view]:
-            model.add(variable == 0)
-        elif program.fixed[view]:
-            model.add(variable == 1)
-    model.add(cp_model.LinearExpr.sum(variables) >= program.min_views)
-    for row, bound in zip(unpack_rows(program.rows.bits, len(hint)), program.rows.bounds, strict=True):
-        model.add(cp_model.LinearExpr.sum([variables[view] for view in np.flatnonzero(row)]) >= int(bound))
-    num_usable = int(program.usable.sum())
-    for view in np.flatnonzero(program.usable).tolist():
-        partners = np.flatnonzero(program.matches[view] & program.usable).tolist()
-        # With so few views that don't match, any selection of N_min views has enough that do.
-        if program.min_views - 1 - (num_usable - 1 - len(partners)) >= program.n_match:
+def _counted(
+    model: mip.Model, variables: list[mip.Variable], program: ViewProgram, viewpoint: NDArray[np.int64]
+) -> list[mip.Variable]:
+    """Per view, whether it counts: only if selected, and one of those at its viewpoint."""
+    counted = list(variables)
+    for number in np.unique(viewpoint[program.usable]):
+        views = np.flatnonzero((viewpoint == number) & program.usable).tolist()
+        if len(views) < 2:
             continue
-        matched = cp_model.LinearExpr.sum([variables[partner] for partner in partners])
-        model.add(matched >= program.n_match * variables[view])
-    return model, variables
+        for view in views:
+            counted[view] = model.new_num_var(0.0, 1.0, f"counts_{view}")
+            model.add(counted[view] <= variables[view])
+        model.add_linear_constraint(mip.LinearExpr.sum([counted[view] for view in views]), 0.0, 1.0)
+    return counted
 
 
 def _solve(
-    model: cp_model.CpModel, variables: list[cp_model.IntVar], max_time_s: float
-) -> tuple[cp_model.CpSolver, NDArray[np.bool_] | None]:
-    """Run the solver so that the same model gives the same result on every machine."""
-    solver = cp_model.CpSolver()
-    solver.parameters.num_workers = 1
-    solver.parameters.random_seed = 0
-    solver.parameters.max_deterministic_time = max_time_s
-    status = solver.solve(model)
-    if status not in (cp_model.OPTIMAL, cp_model.FEASIBLE):
-        return solver, None
-    return solver, np.array([solver.boolean_value(variable) for variable in variables], dtype=np.bool_)
+    program: ViewProgram, set_objective: Callable[[mip.Model, list[mip.Variable]], None], max_nodes: int
+) -> tuple[NDArray[np.bool_] | None, float]:
+    """The best selection that the solver finds, if any, and its bound on the objective.
+
+    Matching constraints are many, dense and seldom active, so a view's constraint joins the model once a solution
+    without it violates it; the result is the same.
+
+    SCIP's limit counts nodes, so that the same model gives the same result on every machine. On a simulated drive with
+    30 to 500 views a cluster, it proves the best quality in about 50 ms without presolving and twice that with; CP-SAT
+    finds no proof in 3 s, for the linear relaxation is nearly whole.
+    """
+    matched = np.zeros(len(program.usable), dtype=np.bool_)
+    while True:
+        model, variables = _model(program, matched)
+        set_objective(model, variables)
+        solver = mip.Solver("SCIP")
+        solver.set_solver_specific_parameters(f"limits/nodes = {max_nodes}\npresolving/maxrounds = 0")
+        status = solver.solve(model)
+        bound = float(solver.best_objective_bound)
+        if status not in (mip.SolveStatus.OPTIMAL, mip.SolveStatus.FEASIBLE):
+            return None, bound
+        selected = np.array([solver.value(variable) > 0.5 for variable in variables], dtype=np.bool_)
+        violated = (program.missing(selected)[1] > 0) & ~matched
+        if not violated.any():
+            return selected if program.is_met_by(selected) else None, bound
+        matched |= violated
+
+
+def _model(program: ViewProgram, matched: NDArray[np.bool_]) -> tuple[mip.Model, list[mip.Variable]]:
+    """The program's constraints, with the matching of the views in ``matched`` only, and no objective."""
+    num_views = len(program.usable)
+    model = mip.Model()  # type: ignore[no-untyped-call]
+    variables = [
+        model.new_int_var(float(program.fixed[view]), float(program.usable[view]), f"view_{view}")
+        for view in range(num_views)
+    ]
+    model.add_linear_constraint(mip.LinearExpr.sum(variables), program.min_views)
+    for row, bound in zip(unpack_rows(program.rows.bits, num_views), program.rows.bounds, strict=True):
+        seeing = mip.LinearExpr.sum([variables[view] for view in np.flatnonzero(row).tolist()])
+        model.add_linear_constraint(seeing, float(bound))
+    for view in np.flatnonzero(matched).tolist():
+        partners = np.flatnonzero(program.matches[view] & program.usable).tolist()
+        terms = [variables[partner] for partner in partners] + [variables[view]]
+        weights = [1.0] * len(partners) + [-float(program.n_match)]
+        model.add_linear_constraint(mip.LinearExpr.weighted_sum(terms, weights), 0.0)
+    return model, variables

@@ -47,20 +47,18 @@ class SelectionOptions:
     Where images are sparse, stereo needs most of the overlap that they have."""
     min_shared_points: int = 20
     """Two views match when they see at least this many common points (keypoints and samples)."""
-    max_solver_time_s: float = 10.0
-    """Time limit of each solver call. It counts the solver's deterministic time, which is close to seconds but the same
-    on every machine."""
+    max_solver_nodes: int = 5_000
+    """Limit of each solver call, in nodes of its search: a limit of time would give other results on other machines.
+    Where it is reached, the gap to the best possible is reported."""
 
     def __post_init__(self) -> None:
-        for name in ("n_vis", "n_match", "n_low", "min_shared_points"):
+        for name in ("n_vis", "n_match", "n_low", "min_shared_points", "max_solver_nodes"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
         if self.n_high < self.n_low:
             raise ValueError(f"n_high must be at least n_low ({self.n_low}), not {self.n_high}")
         if not 0 <= self.min_views_fraction <= 1:
             raise ValueError(f"min_views_fraction must be between 0 and 1, not {self.min_views_fraction}")
-        if not 0 < self.max_solver_time_s < math.inf:
-            raise ValueError(f"max_solver_time_s must be positive, not {self.max_solver_time_s}")
 
     def min_views(self, num_views: int) -> int:
         """N_min for a cluster of ``num_views``, before it is limited by the views there are."""

@@ -40,9 +40,9 @@ class Selection:
     """N_min."""
     size_bound: int
     """No selection that meets the constraints has fewer views."""
-    quality: int = 0
-    """Total view quality in steps; 0 where the method doesn't ask for it."""
-    quality_bound: int = 0
+    quality: float = 0.0
+    """Total view quality; 0 where the method doesn't ask for it."""
+    quality_bound: float = 0.0
     """No selection of this size has more."""
 
     @property
@@ -80,10 +80,10 @@ def select_views(problem: ViewProblem, options: SelectionOptions) -> Selection:
     preference = num_seen.astype(np.float64)
     if options.method is SelectionMethod.OPTIMAL:
         preference = view_quality(problem, visible)
-    solution = smallest_selection(program, preference, options.max_solver_time_s)
+    solution = smallest_selection(program, preference, options.max_solver_nodes)
     if options.method is SelectionMethod.OPTIMAL:
         viewpoint = viewpoints(problem, visible)
-        solution = best_selection(program, solution, preference, viewpoint, options.max_solver_time_s)
+        solution = best_selection(program, solution, preference, viewpoint, options.max_solver_nodes)
     return _selection(problem, program, solution, relaxed, num_points=len(visible))
 
 

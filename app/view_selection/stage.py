@@ -92,7 +92,7 @@ def select(
         report["clusters_per_image"],
     )
     if gaps:
-        logger.warning("%d selections are not proven the best: raise selection.max_solver_time_s", len(gaps))
+        logger.warning("%d selections are not proven the best: raise selection.max_solver_nodes", len(gaps))
     for name in empty:
         logger.warning("cluster %s has no two views that match", name)
 
