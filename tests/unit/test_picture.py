@@ -84,6 +84,17 @@ def test_the_oblique_eye_stands_in_the_south_west() -> None:
     assert red_rows.mean() > blue_rows.mean() + 10
 
 
+def test_seen_from_above_north_is_up_and_east_is_right() -> None:
+    cloud = square(0.0, (60, 60, 60))
+    colors = cloud.colors
+    assert colors is not None
+    colors[(cloud.points[:, 0] > 1) & (cloud.points[:, 1] > 1)] = (0, 255, 0)
+    image = render_cloud(cloud, view=View.TOP, options=OPTIONS).astype(int)
+    rows, columns = np.nonzero(image[..., 1] > 200)
+    assert rows.max() < 50
+    assert columns.min() > 100
+
+
 @pytest.mark.parametrize("view", list(View))
 def test_the_whole_cloud_fits(view: View) -> None:
     cloud = square(0.0, (255, 255, 255))

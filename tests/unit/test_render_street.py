@@ -47,6 +47,17 @@ def test_depth_maps_lie_on_the_mesh(street: tuple[Path, StreetTruth]) -> None:
         assert mesh_distances(world, folder / "gt_mesh.ply").max() < 1e-3
 
 
+@pytest.mark.parametrize("supersampling", [1, 2])
+def test_rays_go_through_pixel_centres(supersampling: int) -> None:
+    camera = SMALL.camera
+    colmap_camera = pycolmap.Camera(model="PINHOLE", width=96, height=60, params=camera.params)
+    rays = camera.rays(supersampling).astype(np.float64)
+    pixels = colmap_camera.img_from_cam(rays.reshape(-1, 3)).reshape(60 * supersampling, 96 * supersampling, 2)
+    whole = pixels.reshape(60, supersampling, 96, supersampling, 2).mean(axis=(1, 3))
+    np.testing.assert_allclose(whole[..., 0], np.tile(np.arange(96) + 0.5, (60, 1)), atol=1e-4)
+    np.testing.assert_allclose(whole[..., 1], np.tile(np.arange(60)[:, None] + 0.5, (1, 96)), atol=1e-4)
+
+
 def test_the_cloud_lies_on_the_mesh_with_normals_towards_a_camera(street: tuple[Path, StreetTruth]) -> None:
     folder, truth = street
     cloud = read_ply(folder / "gt.ply")
