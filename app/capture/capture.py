@@ -18,7 +18,7 @@ from app.capture.poses import match_poses, read_pose_file
 from app.capture.rig import check_prefixes, read_rig_file
 from app.capture.scan import VIDEO_SUFFIXES, Listing, camera_of, check_stems, natural_key, scan, stem_of
 from app.capture.video import Sampling, extract_frames, frame_rate_of, times_along_path
-from app.errors import InputError
+from app.errors import CityReconError, InputError
 
 logger = logging.getLogger(__name__)
 
@@ -97,6 +97,7 @@ def capture(
 
     Raises:
         InputError: the source or one of the files can't be used.
+        CityReconError: the result can't be written.
     """
     source = _existing(source, "image folder or video")
     try:
@@ -152,7 +153,10 @@ def capture(
         mask_root=mask_dir.resolve() if mask_dir else None,
         video_frame_interval_s=interval_s,
     )
-    inventory.write(output / "inventory.json")
+    try:
+        inventory.write(output / "inventory.json")
+    except OSError as error:
+        raise CityReconError(f"cannot write {output / 'inventory.json'}: {error.strerror}; free some space") from error
     return inventory
 
 

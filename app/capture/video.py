@@ -78,7 +78,7 @@ def extract_frames(
     latest = -1
     try:
         for folder in folders:
-            folder.mkdir(parents=True, exist_ok=True)
+            _make_folder(folder)
         motion = [_MotionGate(sampling.min_displacement) for _ in streams]
         for time in _sample_times(sampling):
             images = [stream.frame_at(time) for stream in streams]
@@ -244,6 +244,13 @@ def _sample_times(sampling: Sampling) -> Iterator[float]:
     while True:
         yield index * sampling.interval_s
         index += 1
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CityReconError(f"cannot write {path}: {error.strerror}; free some space") from error
 
 
 def _write_jpeg(path: Path, image: MatLike, quality: int) -> None:

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 _TRIALS = 1_000
 _MAX_SCORED = 2_000
 _INLIER_SIGMAS = 3.0
+_KEPT_SIGMAS = 3.7
+"""Where the noise is known: of 1,000 good positions one is left out."""
 _MIN_SIGMA_M = 1e-3
 _MAX_AUTOCORRELATION = 0.9
 _LEVER_SIGMA_M = 2.0
@@ -127,20 +129,24 @@ def _refine(
     coefficients[0] = offset
     sigma = max(median / _RAYLEIGH_MEDIAN, _MIN_SIGMA_M)
     inliers = np.ones(len(source), dtype=np.bool_)
-    information = 0.0
-    for _ in range(20):
-        chosen = np.abs(factor * source + basis @ coefficients - target) <= _INLIER_SIGMAS * sigma
+    information, noise = 0.0, _MIN_SIGMA_M
+    for iteration in range(20):
+        sigmas = _INLIER_SIGMAS if iteration < 10 else _KEPT_SIGMAS
+        chosen = np.abs(factor * source + basis @ coefficients - target) <= sigmas * sigma
         if chosen.sum() < 3:
             break
         inliers = chosen
         ridge = np.zeros(basis.shape[1])
         ridge[1:] = (sigma / _LEVER_SIGMA_M) ** 2
         factor, coefficients, information = _least_squares(source[chosen], target[chosen], basis[chosen], ridge, scale)
-        sigma = np.median(np.abs(factor * source + basis @ coefficients - target)) / _RAYLEIGH_MEDIAN
-        sigma = max(float(sigma), _MIN_SIGMA_M)
-    errors = factor * source + basis @ coefficients - target
-    freedom = max(2 * int(inliers.sum()) - 2 - 2 * basis.shape[1], 1)
-    noise = max(float(np.sqrt((np.abs(errors[inliers]) ** 2).sum() / freedom)), _MIN_SIGMA_M)
+        errors = np.abs(factor * source + basis @ coefficients - target)
+        freedom = max(2 * int(chosen.sum()) - 2 - 2 * basis.shape[1], 1)
+        noise = max(math.sqrt(float((errors[chosen] ** 2).sum()) / freedom), _MIN_SIGMA_M)
+        # The median withstands gross errors; once these are out, the inliers' spread is the better measure of the
+        # noise, and takes back what was good.
+        median_sigma = max(float(np.median(errors)) / _RAYLEIGH_MEDIAN, _MIN_SIGMA_M)
+        sigma = median_sigma if iteration < 10 else max(median_sigma, noise)
+    residuals = factor * source + basis @ coefficients - target
     arm = abs(factor) * math.sqrt(information)
     turn = factor / abs(factor) if abs(factor) > 0.0 else 1.0
     return PlanarFit(
@@ -149,9 +155,9 @@ def _refine(
         offset_m=complex(coefficients[0]),
         lever_m=complex(coefficients[1] / turn) if basis.shape[1] > 1 else 0j,
         inliers=inliers,
-        residuals_m=np.abs(errors),
+        residuals_m=np.abs(residuals),
         sigma_m=noise,
-        scale_relative_sigma=noise * correlation_inflation(errors[inliers]) / arm if arm > 0.0 else math.inf,
+        scale_relative_sigma=noise * correlation_inflation(residuals[inliers]) / arm if arm > 0.0 else math.inf,
     )
 
 

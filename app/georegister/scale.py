@@ -16,8 +16,8 @@ from app.scene.posed_scene import PosedScene
 logger = logging.getLogger(__name__)
 
 _MIN_BASELINE_M = 0.02
-_MIN_RIG_SIGMA = 0.02
-"""A rig's baseline is short against the street, and models built with a known rig came out 2 % too small."""
+_CALIBRATION_SIGMA_M = 0.005
+"""How well a rig file is taken to know the longest distance between its cameras."""
 
 
 def scale_from_rig(scene: PosedScene, frames: ModelFrames, rig_file: Path) -> ScaleCandidate | None:
@@ -69,9 +69,8 @@ def scale_from_rig(scene: PosedScene, frames: ModelFrames, rig_file: Path) -> Sc
     ratios = np.array(baselines) / np.maximum(np.array(distances), 1e-12) / scale
     spread = float(np.sqrt(np.average((ratios - 1.0) ** 2, weights=baselines)))
     logger.debug("rig: %d baselines, scale %.6g, spread %.2g", len(baselines), scale, spread)
-    return ScaleCandidate(
-        source=ScaleSource.RIG, metres_per_model_unit=scale, relative_sigma=max(_MIN_RIG_SIGMA, spread)
-    )
+    sigma = max(_CALIBRATION_SIGMA_M / max(baselines), spread)
+    return ScaleCandidate(source=ScaleSource.RIG, metres_per_model_unit=scale, relative_sigma=sigma)
 
 
 def frame_spacing(positions: NDArray[np.float64]) -> float:
