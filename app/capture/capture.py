@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pycolmap
 
-from app.capture.gps import assign_gps, mean_position, read_gps_file
+from app.capture.gps import GpsTable, assign_gps, mean_position, read_gps_file
 from app.capture.image_check import ImageProbe, check_images, png_size
 from app.capture.inventory import CameraEntry, FrameEntry, ImageEntry, Inventory
-from app.capture.poses import match_poses, read_pose_file
+from app.capture.poses import PoseFile, match_poses, read_pose_file
 from app.capture.rig import check_prefixes, read_rig_file
 from app.capture.scan import VIDEO_SUFFIXES, Listing, camera_of, check_stems, natural_key, scan, stem_of
 from app.capture.video import Sampling, extract_frames, frame_rate_of, times_along_path
@@ -104,23 +104,17 @@ def capture(
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot write {output}: {error.strerror}; choose another workspace") from error
+    # Small files first: their errors shouldn't wait for all images to be decoded.
+    gps = read_gps_file(gps_file) if gps_file is not None else None
+    poses = read_pose_file(pose_file) if pose_file is not None else None
+    rigs = read_rig_file(rig_file) if rig_file is not None else None
     times_s: dict[str, float] = {}
-    interval_s = None
+    interval_s: float | None = None
     root = source
     listing = _list(source, output, mask_dir)
     if not listing.images:
-        videos = _videos_by_camera(source, listing.videos)
         root = output.absolute() / "frames"
-        sampling = _sampling(videos, gps_file, options)
-        extracted = extract_frames(videos, root, sampling, progress=progress)
-        logger.info(
-            "%d frames from %d video(s), %d left out because the vehicle stood still",
-            len(extracted.times_s),
-            len(videos),
-            extracted.num_still,
-        )
-        times_s = extracted.times_s
-        interval_s = sampling.interval_s if sampling.times_s is None else None
+        times_s, interval_s = _frames_from_videos(source, listing.videos, root, gps, options, progress)
         listing = scan(root.resolve())
     elif listing.videos:
         logger.warning("%s: %d video(s) beside the images are not used", source, len(listing.videos))
@@ -128,26 +122,19 @@ def capture(
     if len(names) < 2:
         raise InputError(f"{source} gives only {len(names)} image; at least two that overlap are needed")
     check_stems(source, names)
-    probes = dict(
-        zip(names, check_images(root, names, num_threads=options.num_threads, progress=progress), strict=True)
-    )
+    if rig_file is not None and rigs is not None:
+        check_prefixes(rig_file, rigs, names)
+    checked = check_images(root, names, num_threads=options.num_threads, progress=progress)
+    probes = dict(zip(names, checked, strict=True))
     cameras = _cameras(source, root, probes)
-    if rig_file is not None:
-        check_prefixes(rig_file, read_rig_file(rig_file), names)
     is_rig = _is_rig([camera.name for camera in cameras], names, options.rig, rig_file)
-    frames = _frames(probes, is_rig, times_s)
-    frames = _with_positions(frames, probes, gps_file, pose_file)
+    frames = _with_positions(_frames(probes, is_rig, times_s), gps, poses)
     masks = _check_masks(mask_dir, probes) if mask_dir else set()
     inventory = Inventory(
         image_root=root,
         cameras=cameras,
         frames=frames,
-        images=tuple(
-            ImageEntry(
-                name=name, size_bytes=probes[name].size_bytes, digest=probes[name].digest, has_mask=name in masks
-            )
-            for name in sorted(names)
-        ),
+        images=_images(probes, masks),
         is_rig=is_rig,
         rig_file=rig_file.resolve() if rig_file else None,
         mask_root=mask_dir.resolve() if mask_dir else None,
@@ -158,6 +145,13 @@ def capture(
     except OSError as error:
         raise CityReconError(f"cannot write {output / 'inventory.json'}: {error.strerror}; free some space") from error
     return inventory
+
+
+def _images(probes: Mapping[str, ImageProbe], masks: set[str]) -> tuple[ImageEntry, ...]:
+    return tuple(
+        ImageEntry(name=name, size_bytes=probe.size_bytes, digest=probe.digest, has_mask=name in masks)
+        for name, probe in sorted(probes.items())
+    )
 
 
 def _existing(path: Path, what: str) -> Path:
@@ -200,10 +194,31 @@ def _videos_by_camera(source: Path, names: Sequence[str]) -> dict[str, Path]:
     return cameras
 
 
-def _sampling(videos: Mapping[str, Path], gps_file: Path | None, options: CaptureOptions) -> Sampling:
+def _frames_from_videos(
+    source: Path,
+    names: Sequence[str],
+    output: Path,
+    gps: GpsTable | None,
+    options: CaptureOptions,
+    progress: Callable[[int, int], None] | None,
+) -> tuple[dict[str, float], float | None]:
+    """Write the frames; returns their times by name and the time between those looked at, if it was constant."""
+    videos = _videos_by_camera(source, names)
+    sampling = _sampling(videos, gps, options)
+    extracted = extract_frames(videos, output, sampling, progress=progress)
+    logger.info(
+        "%d frames from %d video(s), %d left out because the vehicle stood still",
+        len(extracted.times_s),
+        len(videos),
+        extracted.num_still,
+    )
+    return extracted.times_s, sampling.interval_s if sampling.times_s is None else None
+
+
+def _sampling(videos: Mapping[str, Path], gps: GpsTable | None, options: CaptureOptions) -> Sampling:
     times = None
     if options.video_spacing_m is not None:
-        if gps_file is None:
+        if gps is None:
             logger.warning(
                 "no GPS file, so video frames are taken every %g s and not every %g m",
                 options.video_interval_s,
@@ -211,7 +226,7 @@ def _sampling(videos: Mapping[str, Path], gps_file: Path | None, options: Captur
             )
         else:
             rate = frame_rate_of(next(iter(videos.values())))
-            times = times_along_path(read_gps_file(gps_file), options.video_spacing_m, rate)
+            times = times_along_path(gps, options.video_spacing_m, rate)
     return Sampling(
         interval_s=options.video_interval_s,
         times_s=times,
@@ -278,21 +293,19 @@ def _frames(probes: Mapping[str, ImageProbe], is_rig: bool, times_s: Mapping[str
 
 
 def _with_positions(
-    frames: tuple[FrameEntry, ...],
-    probes: Mapping[str, ImageProbe],
-    gps_file: Path | None,
-    pose_file: Path | None,
+    frames: tuple[FrameEntry, ...], gps: GpsTable | None, poses: PoseFile | None
 ) -> tuple[FrameEntry, ...]:
-    if gps_file is not None:
-        gps = assign_gps(frames, read_gps_file(gps_file))
-        frames = tuple(replace(frame, gps=gps.get(frame.name)) for frame in frames)
-        if len(gps) < len(frames):
-            logger.warning("%s has no position for %d of %d frames", gps_file, len(frames) - len(gps), len(frames))
-    if pose_file is not None:
-        poses = match_poses(read_pose_file(pose_file), frames)
+    if gps is not None:
+        positions = assign_gps(frames, gps)
+        frames = tuple(replace(frame, gps=positions.get(frame.name)) for frame in frames)
+        missing = len(frames) - len(positions)
+        if missing:
+            logger.warning("%s has no position for %d of %d frames", gps.path, missing, len(frames))
+    if poses is not None:
+        by_image = match_poses(poses, frames)
         found = []
         for frame in frames:
-            pose = next((poses[image] for image in frame.images.values() if image in poses), None)
+            pose = next((by_image[image] for image in frame.images.values() if image in by_image), None)
             position = None if pose is None else (float(pose[0, 3]), float(pose[1, 3]), float(pose[2, 3]))
             found.append(replace(frame, position_m=position))
         frames = tuple(found)
