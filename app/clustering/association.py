@@ -13,6 +13,7 @@ from app.clustering.kernels import cameras_with_a_view
 from app.clustering.options import ClusteringOptions
 from app.clustering.samples import height_range, sample_axes
 from app.scene.posed_scene import PosedScene
+from fusion.region import ground_cells
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,18 +57,9 @@ def associate(scene: PosedScene, options: ClusteringOptions) -> Blocks:
         options: With lengths in the model's units.
     """
     centers = scene.centers_in_world
-    near = _near_the_cameras(scene.points_in_world, centers, options)
+    near, grid = _grid(scene.points_in_world, centers, options)
     keypoints = scene.points_in_world[near]
     num_far = len(near) - len(keypoints)
-    low = keypoints[:, :2].min(axis=0) if len(keypoints) else np.zeros(2)
-    size = np.array(options.block_size_m)
-    origin = np.floor(low / size) * size
-    grid = GroundGrid(
-        origin_m=(float(origin[0]), float(origin[1])),
-        block_size_m=options.block_size_m,
-        overlap_m=options.overlap_m,
-        sample_spacing_m=options.sample_spacing_m,
-    )
     if len(keypoints) == 0:
         return Blocks(grid=grid, kept=[], dropped=[], num_far_keypoints=num_far)
 
@@ -106,17 +98,26 @@ def associate(scene: PosedScene, options: ClusteringOptions) -> Blocks:
     return Blocks(grid=grid, kept=kept, dropped=dropped, num_far_keypoints=num_far)
 
 
-def _near_the_cameras(
+def _grid(
     points: NDArray[np.float64], centers: NDArray[np.float64], options: ClusteringOptions
-) -> NDArray[np.bool_]:
-    """The robust range of the keypoints: points that some block with an image could hold.
+) -> tuple[NDArray[np.bool_], GroundGrid]:
+    """The keypoints in the robust range, and the grid over them.
 
-    A far outlier would otherwise decide where the grid begins.
+    The range is the cells that a block in reach of some camera could have, so that far outliers neither decide where
+    the grid begins nor how large it is.
     """
-    margin = options.max_camera_distance_m + np.array(options.block_size_m)
-    low, high = centers[:, :2].min(axis=0) - margin, centers[:, :2].max(axis=0) + margin
-    near: NDArray[np.bool_] = np.all((points[:, :2] >= low) & (points[:, :2] <= high), axis=1)
-    return near
+    size = np.array(options.block_size_m)
+    low = np.floor((centers[:, :2].min(axis=0) - options.max_camera_distance_m) / size) - 1
+    high = np.floor((centers[:, :2].max(axis=0) + options.max_camera_distance_m) / size) + 1
+    cells = ground_cells(points, (0.0, 0.0), options.block_size_m)
+    near: NDArray[np.bool_] = np.all((cells >= low) & (cells <= high), axis=1)
+    origin = (cells[near].min(axis=0) if near.any() else low) * size
+    return near, GroundGrid(
+        origin_m=(float(origin[0]), float(origin[1])),
+        block_size_m=options.block_size_m,
+        overlap_m=options.overlap_m,
+        sample_spacing_m=options.sample_spacing_m,
+    )
 
 
 def _count_cells(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:

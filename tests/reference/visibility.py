@@ -16,7 +16,13 @@ def sees(image_from_world: np.ndarray, size_px: np.ndarray, point: np.ndarray) -
 
 def cameras_with_a_view(points: np.ndarray, image_from_world: np.ndarray, sizes_px: np.ndarray) -> list[bool]:
     """Per camera, whether it sees any of the points."""
-    return [any(sees(m, s, p) for p in points) for m, s in zip(image_from_world, sizes_px, strict=True)]
+    found = []
+    for matrix, size_px in zip(image_from_world, sizes_px, strict=True):
+        x, y, z = matrix[:, :3] @ points.T + matrix[:, 3:]
+        front = z > 0
+        u, v = x[front] / z[front], y[front] / z[front]
+        found.append(bool(np.any((u >= 0) & (u < size_px[0]) & (v >= 0) & (v < size_px[1]))))
+    return found
 
 
 def visibility_matrix(points: np.ndarray, image_from_world: np.ndarray, sizes_px: np.ndarray) -> np.ndarray:
