@@ -58,9 +58,11 @@ class SfmOptions:
     sequence_quadratic_window: int = 3
     """And with the frames 2^k beyond the window, k below this number, camera by camera."""
     num_position_neighbors: int = 4
-    """Each frame is matched with this many frames that are near (GPS or position priors) but were taken at another time."""
+    """Each frame is matched with this many frames that are near (GPS, position priors) though taken at another time."""
     max_position_distance_m: float = 20.0
     """But with none farther away than this."""
+    num_similar_images: int = 3
+    """Where no positions are known, each image is matched with this many that look most alike."""
     max_exhaustive_images: int = 30
     """Sets of up to this many images are matched exhaustively."""
     min_registered_ratio: float = 0.9

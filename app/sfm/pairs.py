@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import combinations, product
 
 import numpy as np
@@ -19,11 +19,16 @@ _MIN_DETOUR = 2.0
 """Frames are near again, rather than still, if the path between them is longer than this times their distance."""
 
 
-def image_pairs(inventory: Inventory, options: SfmOptions) -> list[Pair]:
+def image_pairs(inventory: Inventory, options: SfmOptions, more: Iterable[Pair] = ()) -> list[Pair]:
     """Pairs of images to match, without duplicates, sorted by name.
 
     Small sets: all pairs. Else per frame the pairs of its own images (the rig), pairs with the images of following
     frames (the sequence), and pairs with images nearby (positions, where there are any; these close loops).
+
+    Args:
+        inventory: images and frames.
+        options: how far to look.
+        more: pairs from another source.
     """
     names = sorted(image.name for image in inventory.images)
     if len(names) <= options.max_exhaustive_images:
@@ -31,7 +36,7 @@ def image_pairs(inventory: Inventory, options: SfmOptions) -> list[Pair]:
     known = set(names)
     pairs = {
         (min(pair), max(pair))
-        for source in (sequence_pairs(inventory.frames, options), position_pairs(inventory.frames, options))
+        for source in (sequence_pairs(inventory.frames, options), position_pairs(inventory.frames, options), more)
         for pair in source
         if pair[0] != pair[1] and known.issuperset(pair)
     }

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 
 from app.capture.inventory import Inventory
@@ -18,8 +19,9 @@ from app.sfm.known_poses import map_with_poses, read_known_poses
 from app.sfm.mapping import map_images, refine_with_rigs, score
 from app.sfm.matching import match_pairs
 from app.sfm.options import SfmOptions, Strategy
-from app.sfm.pairs import image_pairs
+from app.sfm.pairs import Pair, frame_positions_m, image_pairs
 from app.sfm.report import Attempt, SfmReport, make_report
+from app.sfm.retrieval import similar_pairs
 from app.sfm.rigs import rig_specs
 from app.workspace import remove_tree
 
@@ -28,6 +30,8 @@ __all__ = ["import_model", "run_sfm"]
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[int, int], None]
+_MIN_LOCATED_RATIO = 0.5
+"""With positions of more frames than this, positions alone close loops."""
 _STEPS = 1000
 _FEATURES, _MATCHES = 300, 700
 """Steps of progress after which features and matches are done."""
@@ -67,7 +71,7 @@ def run_sfm(
     run_isolated(
         extract_features, inventory, database, options, log_file=log_file, progress=_part(progress, 0, _FEATURES)
     )
-    pairs = image_pairs(inventory, options)
+    pairs = _pairs(inventory, database, options)
     logger.info("sfm: matching %d pairs of %d images", len(pairs), len(names))
     run_isolated(
         match_pairs,
@@ -95,6 +99,13 @@ def run_sfm(
         progress(_STEPS, _STEPS)
     logger.info("%s", report.describe())
     return report
+
+
+def _pairs(inventory: Inventory, database: Path, options: SfmOptions) -> list[Pair]:
+    located = np.isfinite(frame_positions_m(inventory.frames)).all(axis=1)
+    if len(inventory.images) <= options.max_exhaustive_images or located.mean() > _MIN_LOCATED_RATIO:
+        return image_pairs(inventory, options)
+    return image_pairs(inventory, options, similar_pairs(database, inventory.frames, options))
 
 
 def _part(progress: Progress | None, start: int, end: int) -> Progress | None:

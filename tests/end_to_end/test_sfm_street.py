@@ -20,7 +20,7 @@ from app.sfm.report import SfmReport
 from app.sfm.stage import run_sfm
 
 STREET = Path(__file__).resolve().parents[2] / "sample_data" / "street"
-OPTIONS = SfmOptions(num_threads=1, max_num_features=1500)
+OPTIONS = SfmOptions(num_threads=2, max_num_features=1500)
 NUM_FRAMES = 5
 
 
@@ -63,6 +63,7 @@ def errors_and_scale(model: pycolmap.Reconstruction) -> tuple[NDArray[np.float64
     source = np.array([image.projection_center() for image in images])
     target = np.array([truth[image.name] for image in images])
     found = pycolmap.estimate_sim3d(source, target)
+    assert found is not None
     aligned = np.array([found * center for center in source])
     return np.linalg.norm(aligned - target, axis=1), float(found.scale)
 

@@ -18,9 +18,7 @@ def make_inventory(presence: list[list[bool]], positions: list[tuple[float, floa
     frames = tuple(
         FrameEntry(
             name=f"{number:04d}",
-            images={
-                camera: f"{camera}/{number:04d}.jpg" for camera, there in zip(cameras, row, strict=True) if there
-            },
+            images={camera: f"{camera}/{number:04d}.jpg" for camera, there in zip(cameras, row, strict=True) if there},
             position_m=position,
         )
         for number, (row, position) in enumerate(zip(presence, positions, strict=True))
@@ -76,8 +74,8 @@ def test_pairs(inventory: Inventory, window: int, exhaustive: int) -> None:
 def test_a_place_visited_again_is_matched(num_cameras: int, offset_m: float) -> None:
     """Out along a straight road, and back beside it::
 
-        0 ---> ... ---> 29
-        59 <-- ... <--- 30      offset_m away
+    0 ---> ... ---> 29
+    59 <-- ... <--- 30      offset_m away
     """
     there = [(2.0 * index, 0.0, 0.0) for index in range(30)]
     back = [(2.0 * index, offset_m, 0.0) for index in reversed(range(30))]

@@ -17,9 +17,7 @@ from app.sfm.imports import import_model
 @pytest.fixture
 def model() -> pycolmap.Reconstruction:
     pycolmap.set_random_seed(1)
-    options = pycolmap.SyntheticDatasetOptions(
-        num_rigs=2, num_cameras_per_rig=1, num_frames_per_rig=3, num_points3D=30
-    )
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=2, num_cameras_per_rig=1, num_frames_per_rig=3, num_points3D=30)
     return pycolmap.synthesize_dataset(options)
 
 
@@ -92,7 +90,7 @@ def test_another_image_size_is_refused(model: pycolmap.Reconstruction, tmp_path:
 
 def spoil_pose(model: pycolmap.Reconstruction) -> None:
     frame = model.frame(min(model.reg_frame_ids()))
-    frame.rig_from_world = pycolmap.Rigid3d(frame.rig_from_world.rotation, [np.nan, 0.0, 0.0])
+    frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(), [np.nan, 0.0, 0.0])
 
 
 def spoil_point(model: pycolmap.Reconstruction) -> None:
