@@ -1,0 +1,215 @@
+"""What must hold for the selected views of any cluster, against all subsets where there are few views."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from app.clustering.clusters import cluster_views
+from app.clustering.options import ClusteringOptions
+from app.view_selection.ilp import (
+    ViewProgram,
+    best_selection,
+    greedy_selection,
+    smallest_selection,
+    total_quality,
+)
+from app.view_selection.options import SelectionMethod, SelectionOptions, Visibility
+from app.view_selection.problem import ProblemCutter, ViewProblem
+from app.view_selection.quality import view_quality, viewpoints
+from app.view_selection.reduction import CoveringRows, covering_rows, reduce_rows, required_views
+from app.view_selection.selection import select_views
+from app.view_selection.visibility import pack_rows, unpack_rows, visible_points
+from tests.reference import visibility as plain
+from tests.reference.posed_scenes import random_scene, shuffled
+
+few = settings(max_examples=12, derandomize=True, deadline=None)
+many = settings(max_examples=40, derandomize=True, deadline=None)
+seeds = st.integers(0, 10_000)
+methods = st.sampled_from(list(SelectionMethod))
+
+
+def _subsets(num_views: int) -> np.ndarray:
+    """(2^N, N) all selections."""
+    return np.array(list(itertools.product([False, True], repeat=num_views)), dtype=bool)
+
+
+def _random_program(seed: int, num_views: int) -> tuple[ViewProgram, np.ndarray]:
+    """A program that has a solution, not reduced, and the visibility matrix (P, N) behind its rows."""
+    rng = np.random.default_rng(seed)
+    visible = rng.random((30, num_views)) < rng.uniform(0.1, 0.8, (30, 1))
+    matches = np.triu(rng.random((num_views, num_views)) < rng.uniform(0.2, 0.9), 1)
+    matches |= matches.T
+    usable = np.ones(num_views, dtype=bool)
+    for _ in range(num_views):
+        usable &= (matches @ usable) >= 2
+    rows, _ = covering_rows(pack_rows(visible), pack_rows(usable[None])[0], 2)
+    fixed = usable & (rng.random(num_views) < 0.15)
+    program = ViewProgram(
+        rows=rows,
+        matches=matches,
+        usable=usable,
+        fixed=fixed,
+        n_match=2,
+        min_views=int(rng.integers(0, usable.sum() + 1)),
+    )
+    return program, visible
+
+
+@many
+@given(seeds, st.integers(3, 11))
+def test_the_solver_finds_the_optimum_of_brute_force(seed: int, num_views: int) -> None:
+    program, visible = _random_program(seed, num_views)
+    rng = np.random.default_rng(seed)
+    quality, viewpoint = rng.uniform(0, 5, num_views), rng.integers(0, 4, num_views)
+    bounds = np.minimum((visible & program.usable).sum(axis=1), 2)
+    feasible = [
+        subset
+        for subset in _subsets(num_views)
+        if not (subset & ~program.usable).any()
+        and subset[program.fixed].all()
+        and subset.sum() >= program.min_views
+        and ((visible @ subset.astype(int)) >= bounds).all()
+        and ((program.matches @ subset.astype(int))[subset] >= 2).all()
+    ]
+    smallest = min(subset.sum() for subset in feasible)
+    best = max(total_quality(subset, quality, viewpoint) for subset in feasible if subset.sum() == smallest)
+
+    greedy = greedy_selection(program, quality)
+    assert any(np.array_equal(greedy, subset) for subset in feasible)
+    for reduced in (program, replace(program, rows=reduce_rows(program.rows, pack_rows(program.fixed[None])[0]))):
+        found = smallest_selection(reduced, quality, 1000)
+        assert any(np.array_equal(found.selected, subset) for subset in feasible)
+        assert found.selected.sum() == smallest == found.size_bound
+        found = best_selection(reduced, found, quality, viewpoint, 1000)
+        assert any(np.array_equal(found.selected, subset) for subset in feasible)
+        assert found.selected.sum() == smallest
+        assert found.quality == pytest.approx(best)
+        assert found.quality_bound == found.quality
+
+
+@many
+@given(seeds, st.integers(1, 10), st.integers(1, 4))
+def test_reduction_keeps_exactly_the_same_solutions(seed: int, num_views: int, n_vis: int) -> None:
+    rng = np.random.default_rng(seed)
+    visible = rng.random((rng.integers(0, 40), num_views)) < rng.uniform(0.05, 0.9)
+    usable = rng.random(num_views) < 0.8
+    rows, num_seen_by = covering_rows(pack_rows(visible), pack_rows(usable[None])[0], n_vis)
+    counts = (visible & usable).sum(axis=1)
+    assert num_seen_by.tolist() == [int((counts == number).sum()) for number in range(n_vis)]
+    fixed = required_views(rows) | pack_rows((usable & (rng.random(num_views) < 0.2))[None])[0]
+    reduced = reduce_rows(rows, fixed)
+    assert len(reduced.bounds) <= len(np.unique(visible & usable, axis=0))
+
+    subsets = _subsets(num_views)
+    subsets = subsets[~(subsets & ~usable).any(axis=1)]
+    wanted = ((subsets @ visible.T.astype(int)) >= np.minimum(counts, n_vis)).all(axis=1)
+    required = unpack_rows(required_views(rows)[None], num_views)[0]
+    assert subsets[wanted][:, required].all()
+    with_fixed = subsets[:, unpack_rows(fixed[None], num_views)[0]].all(axis=1)
+    covered = subsets @ unpack_rows(reduced.bits, num_views).T.astype(int)
+    np.testing.assert_array_equal((covered >= reduced.bounds).all(axis=1)[with_fixed], wanted[with_fixed])
+
+
+def _problems(seed: int, num_images: int) -> list[ViewProblem]:
+    scene = random_scene(seed, num_images=num_images)
+    options = ClusteringOptions(sample_spacing_m=4.0, min_cameras_per_cluster=3)
+    clustering = cluster_views(scene, options)
+    cutter = ProblemCutter(scene, clustering.grid)
+    return [cutter.problem(cluster) for cluster in clustering.clusters]
+
+
+@few
+@given(seeds, methods, st.sampled_from(list(Visibility)), st.integers(1, 3), st.integers(1, 3), st.integers(1, 6))
+def test_a_selection_meets_every_constraint_that_is_not_relaxed(
+    seed: int, method: SelectionMethod, visibility: Visibility, n_vis: int, n_match: int, n_low: int
+) -> None:
+    options = SelectionOptions(
+        method=method, visibility=visibility, n_vis=n_vis, n_match=n_match, n_low=n_low, min_shared_points=3
+    )
+    for problem in _problems(seed, 30)[:5]:
+        names = problem.image_names
+        seen = plain.visibility_matrix(problem.samples_in_world, problem.image_from_world, problem.sizes_px)
+        keypoints = plain.visibility_matrix(problem.keypoints_in_world, problem.image_from_world, problem.sizes_px)
+        if visibility is Visibility.TRACKS:
+            keypoints[:] = False
+            keypoints[problem.observations[:, 0], problem.observations[:, 1]] = True
+        seen = np.concatenate([keypoints, seen])
+        matches = plain.share_at_least([set(np.flatnonzero(column).tolist()) for column in seen.T], 3)
+
+        found = select_views(problem, options)
+        listed = [*found.image_names, *itertools.chain(*found.not_selected.values())]
+        assert sorted(listed) == list(names)
+        selected = np.isin(names, found.image_names)
+        excluded = np.zeros(len(names), dtype=bool)
+        for reason, views in found.not_selected.items():
+            if reason.startswith("matches fewer"):
+                excluded = np.isin(names, views)
+        usable = ~excluded
+        required_matches = n_match
+        for text in found.relaxed:
+            if text.startswith("views match"):
+                required_matches = int(text.split()[2])
+        assert (matches[selected][:, selected].sum(axis=1) >= required_matches).all()
+        assert (matches[usable][:, usable].sum(axis=1) >= required_matches).all()
+        usable_counts = seen[:, usable].sum(axis=1)
+        assert (seen[:, selected].sum(axis=1) >= np.minimum(usable_counts, n_vis)).all()
+        wanted = options.min_views(len(names))
+        assert selected.sum() >= min(wanted, usable.sum())
+        for number in range(n_vis):
+            count = int((usable_counts == number).sum())
+            told = [text for text in found.relaxed if f"seen by {number} usable" in text]
+            assert bool(told) == bool(count)
+            assert not told or told[0].startswith(f"{count} points")
+        assert found.size_gap == 0
+
+
+@few
+@given(seeds)
+def test_optimal_is_never_larger_than_paper_and_best_among_its_size(seed: int) -> None:
+    for problem in _problems(seed, 12)[:3]:
+        options = SelectionOptions(n_low=3, n_high=5, min_shared_points=3)
+        optimal = select_views(problem, options)
+        paper = select_views(problem, replace(options, method=SelectionMethod.PAPER))
+        assert len(optimal.image_names) <= len(paper.image_names)
+        if len(optimal.image_names) == len(paper.image_names) and paper.image_names:
+            visible = visible_points(problem, options.visibility)
+            quality, viewpoint = view_quality(problem, visible), viewpoints(problem, visible)
+            chosen = np.isin(problem.image_names, paper.image_names)
+            assert optimal.quality >= total_quality(chosen, quality, viewpoint) - 1e-6
+
+
+@few
+@given(seeds, methods)
+def test_the_paper_forces_the_best_seeing_views(seed: int, method: SelectionMethod) -> None:
+    options = SelectionOptions(method=SelectionMethod.PAPER, n_low=4, n_high=6, min_shared_points=3)
+    for problem in _problems(seed, 20)[:4]:
+        found = select_views(problem, options)
+        points = np.concatenate([problem.keypoints_in_world, problem.samples_in_world])
+        num_seen = plain.visibility_matrix(points, problem.image_from_world, problem.sizes_px).sum(axis=0)
+        excluded = next((v for r, v in found.not_selected.items() if r.startswith("matches fewer")), ())
+        usable = [row for row, name in enumerate(problem.image_names) if name not in excluded]
+        best = sorted(usable, key=lambda row: (-num_seen[row], row))[: found.min_views]
+        assert {problem.image_names[row] for row in best} <= set(found.image_names)
+
+
+@few
+@given(seeds, seeds, methods)
+def test_ids_and_the_order_of_points_do_not_matter(seed: int, order: int, method: SelectionMethod) -> None:
+    scene = random_scene(seed)
+    other, _ = shuffled(scene, order)
+    clustering = cluster_views(scene, ClusteringOptions(sample_spacing_m=4.0))
+    options = SelectionOptions(method=method)
+    for cluster in clustering.clusters[:4]:
+        expected = select_views(ProblemCutter(scene, clustering.grid).problem(cluster), options)
+        assert select_views(ProblemCutter(other, clustering.grid).problem(cluster), options) == expected
+
+
+def test_rows_without_points() -> None:
+    empty = CoveringRows(bits=np.empty((0, 2), dtype=np.uint64), bounds=np.empty(0, dtype=np.int64))
+    assert len(reduce_rows(empty, required_views(empty)).bounds) == 0
