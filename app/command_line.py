@@ -177,7 +177,7 @@ def _settings(arguments: dict[str, Any], sections: tuple[str, ...]) -> dict[str,
 
 
 def _options_class(section: str) -> type:
-    return next(f.default_factory for f in fields(RunConfig) if f.name == section)  
+    return type(getattr(RunConfig(), section))
 
 
 def _flags(section: str) -> list[inspect.Parameter]:
@@ -191,7 +191,8 @@ def _flags(section: str) -> list[inspect.Parameter]:
         if default is not None and default != "":
             text += f" Default: {' '.join(map(str, default)) if isinstance(default, tuple) else default}."
         spelling = f"--{flag}/--no-{flag}" if kind is bool else f"--{flag}"
-        annotation = Annotated[_flag_type(kind), typer.Option(spelling, help=text, show_default=False)]
+        flag_type = _flag_type(kind)
+        annotation = Annotated[flag_type, typer.Option(spelling, help=text, show_default=False)]  # type: ignore[valid-type]
         flags.append(_parameter(f"{section}__{name}", annotation, None))
     return flags
 

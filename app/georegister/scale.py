@@ -51,7 +51,7 @@ def scale_from_rig(scene: PosedScene, frames: ModelFrames, rig_file: Path) -> Sc
     centers = np.full((num_cameras, len(frames.frames), 3), np.nan)
     used = np.flatnonzero(frames.image_frames >= 0)
     centers[frames.image_cameras[used], frames.image_frames[used]] = scene.centers_in_world[used]
-    baselines, distances = [], []
+    baselines, distances, variations = [], [], []
     for first in range(num_cameras):
         for second in range(first + 1, num_cameras):
             baseline = float(np.linalg.norm(known[first] - known[second]))
@@ -62,6 +62,7 @@ def scale_from_rig(scene: PosedScene, frames: ModelFrames, rig_file: Path) -> Sc
             if len(distance):
                 baselines.append(baseline)
                 distances.append(float(np.median(distance)))
+                variations.append(1.4826 * float(np.median(np.abs(distance / distances[-1] - 1.0))))
     if not baselines or not sum(distances) > 0.0:
         return None
     # Longer baselines are known better: one ratio of sums, not a mean of ratios.
@@ -69,7 +70,9 @@ def scale_from_rig(scene: PosedScene, frames: ModelFrames, rig_file: Path) -> Sc
     ratios = np.array(baselines) / np.maximum(np.array(distances), 1e-12) / scale
     spread = float(np.sqrt(np.average((ratios - 1.0) ** 2, weights=baselines)))
     logger.debug("rig: %d baselines, scale %.6g, spread %.2g", len(baselines), scale, spread)
-    sigma = max(_CALIBRATION_SIGMA_M / max(baselines), spread)
+    # A model built with the rig has the same distances in all frames; one built without it tells by their variation how
+    # well it knows them.
+    sigma = max(_CALIBRATION_SIGMA_M / max(baselines), spread, *variations)
     return ScaleCandidate(source=ScaleSource.RIG, metres_per_model_unit=scale, relative_sigma=sigma)
 
 

@@ -400,7 +400,7 @@ def _update_pixel(x, y, variance, state, reference, sources, window, search, scr
     state.best_view[y, x] = scratch.chosen[0]
 
 
-@njit(**COMPILED)
+@njit(cache=True, **COMPILED)
 def sweep_rows(first_row, last_row, colour, state, reference, sources, window, search, scratch):
     """Update the pixels of one checkerboard colour in a band of rows.
 
@@ -417,7 +417,7 @@ def sweep_rows(first_row, last_row, colour, state, reference, sources, window, s
                 _update_pixel(x, y, variance, state, reference, sources, window, search, scratch)
 
 
-@njit(**COMPILED)
+@njit(cache=True, **COMPILED)
 def initialise_rows(first_row, last_row, num_random, state, reference, sources, window, search, scratch):
     """Give each pixel of a band of rows the best of its hypothesis so far and random ones, by its better views."""
     width = reference.inverse_range.shape[1]

@@ -29,8 +29,8 @@ MAX_COST = np.float32(2)
 MIN_VARIANCE = np.float32(0.6)
 """Patches of less variance (grey values squared) have no texture."""
 
-COMPILED: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy", "_nrt": False}
-"""How all kernels of this back-end are compiled.
+COMPILED: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "_nrt": False}
+"""How all kernels of this back-end are compiled, those called from Python with `cache=True` on top.
 
 Without numba's reference counting: kernels only borrow arrays, and counting each use of one took two thirds of the time
 of a cost. So nothing may be allocated in a kernel.
@@ -150,7 +150,7 @@ def new_scratch(num_views: int) -> Scratch:
     )
 
 
-@njit(**COMPILED)
+@njit(cache=True, **COMPILED)
 def pack_neighbours(grey: NDArray[np.uint8], out: NDArray[np.uint32]) -> None:
     """Write each pixel and its right, lower and lower right neighbours into one uint32 of the flat (H * W,) out."""
     height, width = grey.shape
@@ -265,7 +265,9 @@ def geometric_error(j, x, y, w, sources, cap):
     z = _ONE / z
     ex = (r[0] * mx + r[1] * my + r[2] + r[9] * there) * z - fx
     ey = (r[3] * mx + r[4] * my + r[5] + r[10] * there) * z - fy
-    return min(np.sqrt(ex * ex + ey * ey), cap)
+    error = min(np.sqrt(ex * ex + ey * ey), cap)
+    # Flat at 0, unlike ACMM's: the maps of the pass before, half as fine, must not pull the depth within a pixel.
+    return error * error / (_ONE + error)
 
 
 @njit(forceinline=True, **COMPILED)

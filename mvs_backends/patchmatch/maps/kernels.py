@@ -15,7 +15,7 @@ _HALF = np.float32(0.5)
 _ONE = np.float32(1)
 
 
-@njit(**COMPILED)
+@njit(cache=True, **COMPILED)
 def upsample(coarse, coarse_cost, coarse_view, coarse_grey, scale_x, scale_y, state, reference):
     """Carry a coarser level's hypotheses to a finer one: of the 4 nearest, the one of the most similar grey value.
 
@@ -58,7 +58,7 @@ def upsample(coarse, coarse_cost, coarse_view, coarse_grey, scale_x, scale_y, st
                 state.plane[y, x, 0] = _HALF * (low + high)
 
 
-@njit(**COMPILED)
+@njit(cache=True, **COMPILED)
 def smooth_rows(first_row, last_row, radius, plane, reference, sources, out):
     """Average each pixel's plane with those of its neighbourhood that agree with it, in a band of rows.
 
