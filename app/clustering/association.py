@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,13 +30,20 @@ class Block:
     """Ascending."""
 
 
+class DropReason(StrEnum):
+    """Why a cell isn't reconstructed."""
+
+    FEW_KEYPOINTS = "fewer keypoints than min_keypoints_per_block"
+    NO_IMAGE = "no image sees it from within max_camera_distance_m"
+
+
 @dataclass(frozen=True, kw_only=True)
 class DroppedBlock:
     """A cell with keypoints that isn't reconstructed."""
 
     cell: Cell
     num_keypoints: int
-    reason: str
+    reason: DropReason
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,8 +79,7 @@ def associate(scene: PosedScene, options: ClusteringOptions) -> Blocks:
     for i, j, count in zip(*_count_cells(keypoint_cells), strict=True):
         cell = (int(i), int(j))
         if count < options.min_keypoints_per_block:
-            reason = f"{count} keypoints, fewer than {options.min_keypoints_per_block}"
-            dropped.append(DroppedBlock(cell=cell, num_keypoints=int(count), reason=reason))
+            dropped.append(DroppedBlock(cell=cell, num_keypoints=int(count), reason=DropReason.FEW_KEYPOINTS))
             continue
         around = keypoints[keypoint_index.rows_around(cell, (1, 1))]
         z_range = height_range(
@@ -91,8 +98,7 @@ def associate(scene: PosedScene, options: ClusteringOptions) -> Blocks:
         x, y, z = sample_axes(box, options.sample_spacing_m)
         with_view = cameras_with_a_view(around[inside], x, y, z, image_from_world[candidates], sizes_px[candidates])
         if not with_view.any():
-            reason = f"no image sees it from {options.max_camera_distance_m:g} or less away"
-            dropped.append(DroppedBlock(cell=cell, num_keypoints=int(count), reason=reason))
+            dropped.append(DroppedBlock(cell=cell, num_keypoints=int(count), reason=DropReason.NO_IMAGE))
             continue
         kept.append(Block(cells=(cell,), num_keypoints=int(count), z_range_m=z_range, image_rows=candidates[with_view]))
     return Blocks(grid=grid, kept=kept, dropped=dropped, num_far_keypoints=num_far)

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from app.clustering.association import DroppedBlock, associate
+from app.clustering.association import DroppedBlock, DropReason, associate
 from app.clustering.grid import Cell, GroundGrid
 from app.clustering.merging import merge_small_blocks
 from app.clustering.options import ClusteringOptions
@@ -90,15 +90,18 @@ class Clustering:
                 return cls(
                     grid=grid,
                     clusters=tuple(_cluster(grid, json.loads(line)) for line in file),
-                    dropped=tuple(
-                        DroppedBlock(**{**block, "cell": tuple(block["cell"])}) for block in header["dropped"]
-                    ),
+                    dropped=tuple(_dropped_block(record) for record in header["dropped"]),
                     num_far_keypoints=header["num_far_keypoints"],
                 )
         except OSError as error:
             raise InputError(f"cannot read {path}: {error.strerror}; run `cityrecon cluster` first") from error
         except (ValueError, KeyError, TypeError) as error:
             raise InputError(f"{path} is damaged; remove its folder and run `cityrecon cluster` again") from error
+
+
+def _dropped_block(record: dict[str, Any]) -> DroppedBlock:
+    i, j = record["cell"]
+    return DroppedBlock(cell=(i, j), num_keypoints=record["num_keypoints"], reason=DropReason(record["reason"]))
 
 
 def _cluster(grid: GroundGrid, record: dict[str, Any]) -> Cluster:

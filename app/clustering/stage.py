@@ -78,12 +78,8 @@ def _log(report: dict[str, Any]) -> None:
         report["images_per_cluster"],
         report["clusters_per_image"],
     )
-    if report["dropped_blocks"]:
-        keypoints = Counter[str]()
-        for block in report["dropped_blocks"]:
-            keypoints["no image" if block["reason"].startswith("no image") else "few keypoints"] += 1
-        reasons = ", ".join(f"{count} with {reason}" for reason, count in sorted(keypoints.items()))
-        logger.info("%d blocks dropped: %s", len(report["dropped_blocks"]), reasons)
+    for reason, count in sorted(Counter(block["reason"] for block in report["dropped_blocks"]).items()):
+        logger.info("%d blocks dropped: %s", count, reason)
     if report["images_in_no_cluster"]:
         logger.info("%d images see no cluster and are not used", len(report["images_in_no_cluster"]))
     for name, count in report["small_clusters"].items():

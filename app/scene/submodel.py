@@ -36,9 +36,11 @@ def write_submodel(
             camera_id=int(scene.camera_ids[row]), model="PINHOLE", width=width, height=height, params=params
         )
         model.add_camera_with_trivial_rig(camera)
+    by_image = np.argsort(image_of_observation, kind="stable")
+    starts = np.searchsorted(image_of_observation[by_image], np.append(images, images[-1:] + 1))
     slot_in_image = np.empty(len(pixels), dtype=np.int64)
-    for row in images:
-        in_image = np.flatnonzero(image_of_observation == row)
+    for row, start, end in zip(images, starts[:-1], starts[1:], strict=True):
+        in_image = by_image[start:end]
         slot_in_image[in_image] = np.arange(len(in_image))
         image = pycolmap.Image(
             name=scene.image_names[row],

@@ -10,7 +10,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.clustering.association import Block
+from app.clustering.association import Block, DropReason
 from app.clustering.clusters import cluster_views
 from app.clustering.merging import merge_small_blocks
 from app.clustering.options import ClusteringOptions
@@ -57,7 +57,7 @@ def test_every_cell_with_enough_keypoints_is_in_exactly_one_cluster_or_has_no_im
             assert count >= options.min_keypoints_per_block
         elif cell in dropped:
             assert dropped[cell].num_keypoints == count
-            assert count < options.min_keypoints_per_block or dropped[cell].reason.startswith("no image")
+            assert count < options.min_keypoints_per_block or dropped[cell].reason is DropReason.NO_IMAGE
         else:
             num_far += count
             cameras = scene.centers_in_world[:, :2]

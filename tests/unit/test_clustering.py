@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.clustering.association import Block
+from app.clustering.association import Block, DropReason
 from app.clustering.clusters import Clustering, cluster_views
 from app.clustering.grid import CellIndex
 from app.clustering.merging import merge_small_blocks
@@ -56,8 +56,8 @@ def test_walls_in_front_are_clusters_and_the_rest_is_dropped_with_a_reason() -> 
         assert found.num_keypoints == 6
     reasons = {block.cell: block.reason for block in clustering.dropped}
     behind, stray, too_far = sorted(reasons)
-    assert reasons[behind] == reasons[too_far] == "no image sees it from 40 or less away"
-    assert reasons[stray] == "2 keypoints, fewer than 5"
+    assert reasons[behind] == reasons[too_far] == DropReason.NO_IMAGE
+    assert reasons[stray] == DropReason.FEW_KEYPOINTS
     assert clustering.num_far_keypoints == 6
 
 
