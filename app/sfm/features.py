@@ -100,17 +100,27 @@ def opencv_features(image: Grey, mask: Grey | None, max_num_features: int) -> Fe
     Args:
         image: (H, W) grey values.
         mask: (H, W), 0 where no features are wanted.
-        max_num_features: the ones of highest contrast are kept.
+        max_num_features: half of them the largest, half those of highest contrast.
     """
     # Without precise upscaling OpenCV's keypoints are shifted by a quarter of a pixel.
-    sift = cv2.SIFT.create(nfeatures=max_num_features, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(enable_precise_upscale=True)
     points, descriptors = sift.detectAndCompute(image, mask)
     if descriptors is None or not len(points):
         return np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8)
     keypoints = np.array([(*point.pt, point.size / 2, np.deg2rad(point.angle)) for point in points], np.float32)
     keypoints[:, :2] += 0.5
+    kept = _choose([(point.size, point.response) for point in points], max_num_features)
+    keypoints, descriptors = keypoints[kept], descriptors[kept]
     root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12))
     return keypoints, np.clip(np.rint(root * 512), 0, 255).astype(np.uint8)
+
+
+def _choose(size_and_response: list[tuple[float, float]], max_num_features: int) -> NDArray[np.intp]:
+    """Rows of the features to keep: half the largest, which match over wide baselines, half those of most contrast."""
+    table = np.array(size_and_response)
+    largest = np.argsort(-table[:, 0], kind="stable")[: max_num_features // 2]
+    table[largest, 1] = np.inf
+    return np.sort(np.argsort(-table[:, 1], kind="stable")[:max_num_features])
 
 
 def _features_of(

@@ -56,8 +56,8 @@ def describe_images(database_path: Path, names: Sequence[str], seed: int) -> Arr
         ids = {image.name: image.image_id for image in database.read_all_images()}
 
         def read(name: str) -> Array:
-            data = np.asarray(database.read_descriptors(ids[name]).data, np.float32) / 512
-            return data[np.sort(generator.permutation(len(data))[:_PER_IMAGE])]
+            data: Array = np.asarray(database.read_descriptors(ids[name]).data, np.float32)
+            return data[np.sort(generator.permutation(len(data))[:_PER_IMAGE])] / np.float32(512)
 
         per_image = max(_WORDS_FROM // len(names), 20)
         sample = np.concatenate([data[:: max(len(data) // per_image, 1)] for data in map(read, names)])
@@ -73,7 +73,7 @@ def describe_images(database_path: Path, names: Sequence[str], seed: int) -> Arr
                 length = max(float(np.linalg.norm(difference)), 1e-12)
                 described[row, word * words.shape[1] : (word + 1) * words.shape[1]] = difference / length
     norms = np.linalg.norm(described, axis=1, keepdims=True)
-    described /= np.maximum(norms, 1e-12)
+    described /= np.maximum(norms, np.float32(1e-12))
     return described
 
 
