@@ -9,6 +9,7 @@ import pycolmap
 import pytest
 
 from app.errors import InputError
+from app.scene.kernels import index_images, index_points
 from app.scene.posed_scene import PosedScene
 from app.scene.read_model import read_posed_scene
 from app.scene.submodel import write_submodel
@@ -109,6 +110,19 @@ def test_cameras_are_undistorted(tmp_path: Path) -> None:
 def _model_bytes(folder: Path) -> Path:
     write_submodel(_visible_scene(), np.arange(3), np.arange(6), folder)
     return folder
+
+
+def test_the_order_of_records_does_not_matter(tmp_path: Path) -> None:
+    write_submodel(random_scene(4), np.arange(24), np.arange(200), tmp_path)
+    expected = read_posed_scene(tmp_path)
+    for name, index in (("images", index_images), ("points3D", index_points)):
+        path = tmp_path / f"{name}.bin"
+        content = path.read_bytes()
+        found = index(np.frombuffer(content, dtype=np.uint8), int.from_bytes(content[:8], "little"))
+        starts = found.reshape(len(found), -1)[:, 0]
+        records = [content[start:end] for start, end in zip(starts[:-1], starts[1:], strict=True)]
+        path.write_bytes(content[:8] + b"".join(records[::-1]))
+    _equal(read_posed_scene(tmp_path), expected)
 
 
 def test_names_with_spaces(tmp_path: Path) -> None:
