@@ -108,9 +108,7 @@ class MvsBackend(ABC):
         """Whether this back-end can run on this machine."""
 
     @abstractmethod
-    def estimate(
-        self, *, job: MvsJob, options: MvsOptions, num_threads: int, progress: Progress | None = None
-    ) -> None:
+    def estimate(self, *, job: MvsJob, options: MvsOptions, num_threads: int, progress: Progress | None = None) -> None:
         """Leave one depth map and one normal map per reference view at the job's paths.
 
         A pair of maps appears whole or not at all, and maps already there are kept, so that a stopped job can be

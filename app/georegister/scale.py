@@ -16,8 +16,9 @@ from app.scene.posed_scene import PosedScene
 logger = logging.getLogger(__name__)
 
 _MIN_BASELINE_M = 0.02
-_CALIBRATION_SIGMA_M = 0.005
-"""How well a rig file is taken to know the longest distance between its cameras."""
+_CALIBRATION_SIGMA_M = 0.002
+"""How well a rig file is taken to know the longest distance between its cameras: such calibrations are good to
+millimetres."""
 
 
 def scale_from_rig(scene: PosedScene, frames: ModelFrames, rig_file: Path) -> ScaleCandidate | None:

@@ -23,13 +23,13 @@ class PatchMatchOptions:
     """Further sweeps at the coarsest level with the planar prior. ACMP: 3. 0: no planar prior."""
     num_random: int = 8
     """Random hypotheses per pixel at the start, beside the one interpolated from sparse points. ACMM: 1."""
-    geometric_weight: float = 0.2
+    geometric_weight: float = 0.05
     """Weight lambda of the forward-backward reprojection error. ACMM: 0.2. 0: photometric only."""
     max_geometric_error_px: float = 3.0
     """Truncation delta of the reprojection error. ACMM: 3."""
     sigma_space_px: float = 5.0
     """Bilateral weight: spread over distance. ACMM: 5."""
-    sigma_grey: float = 12.0
+    sigma_grey: float = 10.0
     """Bilateral weight: spread over grey values of 0 to 255. ACMM: 3 for COLMAP-like weights."""
     min_angle_deg: float = 1.5
     """Source views with a smaller triangulation angle lose weight quadratically. 0: no."""

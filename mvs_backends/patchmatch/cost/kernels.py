@@ -41,6 +41,7 @@ _HALF = np.float32(0.5)
 _ONE = np.float32(1)
 _TWO = np.float32(2)
 _TINY = np.float32(1e-12)
+_REACH = np.float32(3)
 _BYTE = np.uint32(255)
 _S8, _S16, _S24 = np.uint32(8), np.uint32(16), np.uint32(24)
 
@@ -49,7 +50,7 @@ class Reference(NamedTuple):
     """The reference view of one sweep, H x W pixels."""
 
     padded_grey: NDArray[np.uint8]
-    """(H + 10, W + 10), the image with its border pixels repeated, so that the window needs no test."""
+    """(H + 10, W + 10), the image in a border, so that the window needs no test inside."""
     inverse_range: NDArray[np.float32]
     """(H, W, 2) smallest and largest inverse depth to search; both 0 where nothing is wanted."""
     intrinsics: NDArray[np.float32]
@@ -176,6 +177,12 @@ def sample_reference(grey, x, y, window, weight, centred):
         value = np.int32(grey[np.uint64(py + window.row[i]), np.uint64(px + window.column[i])])
         weight[i] = window.space_weight[i] * window.grey_weight[np.uint64(abs(value - center))]
         centred[i] = np.float32(value)
+    height, width = grey.shape[0] - 2 * PADDING, grey.shape[1] - 2 * PADDING
+    if x < PADDING or y < PADDING or x >= width - PADDING or y >= height - PADDING:
+        for i in range(NUM_SAMPLES):
+            sx, sy = x + window.column[i], y + window.row[i]
+            if sx < 0 or sy < 0 or sx >= width or sy >= height:
+                weight[i] = _ZERO
     for i in range(NUM_SAMPLES):
         total += weight[i]
         mean += weight[i] * centred[i]
@@ -202,7 +209,12 @@ def view_cost(j, pixel_x, pixel_y, w, a, b, variance, sources, window, scratch):
     uz, vz = warp[6] + warp[11] * a, warp[7] + warp[11] * b
     if bz <= np.float32(7) * (abs(uz) + abs(vz)) + _TINY:
         return MAX_COST
-    if bx < _ZERO or by < _ZERO or bx > limit_x * bz or by > limit_y * bz:
+    # Most of the patch must lie in the source image; first order around its centre.
+    z = _ONE / bz
+    px, py = bx * z, by * z
+    reach_x = _REACH * z * (abs(ux - px * uz) + abs(vx - px * vz))
+    reach_y = _REACH * z * (abs(uy - py * uz) + abs(vy - py * vz))
+    if px < reach_x or py < reach_y or px > limit_x - reach_x or py > limit_y - reach_y:
         return MAX_COST
     dx, dy = window.dx, window.dy
     fx, fy, index, value = scratch.fx, scratch.fy, scratch.texel, scratch.value
