@@ -47,6 +47,9 @@ def fuse_depth_maps(
         options: agreement of views.
         bounds: (2, 3) minimum and maximum corner of the region of interest, world frame.
 
+    Returns:
+        The cloud; empty if the views agree on no point.
+
     Raises:
         FusionError: the maps are missing or unreadable.
     """
@@ -58,7 +61,12 @@ def fuse_depth_maps(
     fusion.max_normal_error = options.max_normal_error_deg
     fusion.bounding_box = (bounds[0], bounds[1])
     try:
-        pycolmap.stereo_fusion(str(output), str(workspace), input_type="geometric", options=fusion, output_type="PLY")
+        fused = pycolmap.stereo_fusion(
+            str(output), str(workspace), input_type="geometric", options=fusion, output_type="PLY"
+        )
     except (ValueError, RuntimeError) as error:
         raise FusionError(f"{workspace}: stereo fusion failed: {error}") from error
+    if fused.num_points3D() == 0:
+        nothing = np.empty((0, 3), dtype=np.float32)
+        return PointCloud(nothing, nothing, np.empty((0, 3), dtype=np.uint8))
     return read_ply(output)
