@@ -9,7 +9,6 @@ import typer
 
 from app.command_line import (
     ConfigOption,
-    Run,
     SetOption,
     VerboseOption,
     WorkspaceArgument,
@@ -18,6 +17,7 @@ from app.command_line import (
     stage_command,
 )
 from app.config import format_config
+from app.run import Run
 
 app = typer.Typer(
     name="cityrecon",
@@ -108,7 +108,7 @@ def capture(
     """Take stock of images, or extract frames from videos."""
     from app.stages import CaptureSources, capture_stage
 
-    capture_stage(run.workspace, CaptureSources(images=images, gps=gps, rig=rig, masks=masks), run.config)
+    capture_stage(run, CaptureSources(images=images, gps=gps, rig=rig, masks=masks))
 
 
 @stage_command(app, "sfm")
@@ -116,7 +116,7 @@ def sfm(run: Run, poses: PosesOption = None, model: ImportOption = None) -> None
     """Find poses and sparse points (Structure-from-Motion), or import them."""
     from app.stages import sfm_stage
 
-    sfm_stage(run.workspace, run.config, model=model, poses=poses)
+    sfm_stage(run, model=model, poses=poses)
 
 
 @stage_command(app, "georegister")
@@ -124,7 +124,7 @@ def georegister(run: Run) -> None:
     """Turn the model to z up, in metres, in ENU where GPS is known."""
     from app.stages import georegister_stage
 
-    georegister_stage(run.workspace, run.config)
+    georegister_stage(run)
 
 
 @stage_command(app, "clustering")
@@ -132,7 +132,7 @@ def cluster(run: Run) -> None:
     """Cut the model into overlapping clusters on a ground grid."""
     from app.stages import cluster_stage
 
-    cluster_stage(run.workspace, run.config)
+    cluster_stage(run)
 
 
 @stage_command(app, "selection")
@@ -140,7 +140,7 @@ def select(run: Run) -> None:
     """Select the smallest set of views of each cluster that sees and matches everything."""
     from app.stages import select_stage
 
-    select_stage(run.workspace, run.config, num_jobs=run.num_jobs)
+    select_stage(run)
 
 
 @stage_command(app, "densify", "stereo")

@@ -9,7 +9,7 @@ import sys
 import time
 import types
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Concatenate, ParamSpec
 
@@ -18,6 +18,7 @@ import typer
 from app.config import RunConfig, format_config, option_docs, option_types, parse_setting, read_config, update_config
 from app.errors import CityReconError, InputError
 from app.log import format_seconds, log_to_console, log_to_file
+from app.run import Run
 from app.stage import RECORD
 from app.workspace import Workspace, atomic_file, remove_tree
 from fusion.errors import CloudFormatError, FusionError
@@ -37,15 +38,6 @@ SetOption = Annotated[
 JobsOption = Annotated[int, typer.Option("--jobs", "-j", min=0, help="Clusters at a time. 0: one per core.")]
 VerboseOption = Annotated[bool, typer.Option("--verbose", "-v", help="Show details.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show warnings and errors only.")]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Run:
-    """What a command works on."""
-
-    workspace: Workspace
-    config: RunConfig
-    num_jobs: int
 
 
 def stage_command(

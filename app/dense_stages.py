@@ -11,16 +11,16 @@ import pycolmap
 
 from app.capture.inventory import Inventory
 from app.clustering.clusters import Clustering
-from app.config import RunConfig
 from app.dense_job import DenseJob, write_dense_job
 from app.densify import Task, densify_inputs, densify_job, fuse_inputs, fuse_job, run_tasks
 from app.errors import CityReconError, InputError
 from app.executor import split_cores
 from app.log import ProgressLine
+from app.run import Run
 from app.scene.read_model import read_posed_scene
-from app.stage import StageRecord, finished_product, is_current, run_stage
+from app.stage import finished_product, is_current, run_stage
 from app.view_selection.selection import read_selections
-from app.workspace import Workspace, atomic_file, remove_tree
+from app.workspace import atomic_file, remove_tree
 from fusion.merge import merge_clouds
 from fusion.region import GroundRegion
 from mvs_backends import get_backend
@@ -29,7 +29,7 @@ logger = logging.getLogger(__name__)
 
 
 def _write_jobs(
-    workspace: Workspace, folder: Path, jobs: Callable[[], Mapping[str, tuple[tuple[str, ...], GroundRegion]]]
+    run: Run, folder: Path, jobs: Callable[[], Mapping[str, tuple[tuple[str, ...], GroundRegion]]]
 ) -> dict[str, Path]:
     """Write a job folder per name for given images and region.
 
@@ -38,9 +38,9 @@ def _write_jobs(
     """
 
     def work(partial: Path) -> None:
-        scene = read_posed_scene(workspace.georegistered_model)
-        cameras = pycolmap.Reconstruction(str(workspace.georegistered_model)).cameras
-        digests = {image.name: image.digest for image in Inventory.read(workspace.inventory_file).images}
+        scene = read_posed_scene(run.workspace.georegistered_model)
+        cameras = pycolmap.Reconstruction(str(run.workspace.georegistered_model)).cameras
+        digests = {image.name: image.digest for image in Inventory.read(run.workspace.inventory_file).images}
         row_of_name = {name: row for row, name in enumerate(scene.image_names)}
         for name, (image_names, region) in jobs().items():
             remove_tree(partial / name)
@@ -57,10 +57,10 @@ def _write_jobs(
         folder,
         options={},
         inputs={
-            "selection": finished_product(workspace.root / "selection", "select"),
-            "clusters": finished_product(workspace.root / "clusters", "cluster"),
-            "model": finished_product(workspace.root / "georegister", "georegister"),
-            "images": finished_product(workspace.root / "capture", "capture"),
+            "selection": finished_product(run.workspace.root / "selection", "select"),
+            "clusters": finished_product(run.workspace.root / "clusters", "cluster"),
+            "model": finished_product(run.workspace.root / "georegister", "georegister"),
+            "images": finished_product(run.workspace.root / "capture", "capture"),
         },
         work=work,
         product=lambda made: "",
@@ -68,25 +68,25 @@ def _write_jobs(
     return {path.name: path for path in sorted(folder.iterdir()) if path.is_dir()}
 
 
-def cluster_jobs(workspace: Workspace) -> dict[str, Path]:
+def cluster_jobs(run: Run) -> dict[str, Path]:
     """Write one job folder per cluster: its selected views, its cells."""
 
     def jobs() -> dict[str, tuple[tuple[str, ...], GroundRegion]]:
-        clusters = Clustering.read(workspace.root / "clusters")
+        clusters = Clustering.read(run.workspace.root / "clusters")
         regions = {cluster.name: cluster.region() for cluster in clusters.clusters}
         return {
             selection.cluster: (selection.image_names, regions[selection.cluster])
-            for selection in read_selections(workspace.root / "selection")
+            for selection in read_selections(run.workspace.root / "selection")
         }
 
-    return _write_jobs(workspace, workspace.root / "jobs", jobs)
+    return _write_jobs(run, run.workspace.root / "jobs", jobs)
 
 
-def batch_jobs(workspace: Workspace) -> dict[str, Path]:
+def batch_jobs(run: Run) -> dict[str, Path]:
     """Write the one job of a batch reconstruction: all views, all cells."""
 
     def jobs() -> dict[str, tuple[tuple[str, ...], GroundRegion]]:
-        regions = [cluster.region() for cluster in Clustering.read(workspace.root / "clusters").clusters]
+        regions = [cluster.region() for cluster in Clustering.read(run.workspace.root / "clusters").clusters]
         region = GroundRegion(
             cells=tuple(sorted({cell for region in regions for cell in region.cells})),
             origin_m=regions[0].origin_m,
@@ -94,14 +94,12 @@ def batch_jobs(workspace: Workspace) -> dict[str, Path]:
             z_range_m=(min(r.z_range_m[0] for r in regions), max(r.z_range_m[1] for r in regions)),
             padding_m=regions[0].padding_m,
         )
-        return {"all": (read_posed_scene(workspace.georegistered_model).image_names, region)}
+        return {"all": (read_posed_scene(run.workspace.georegistered_model).image_names, region)}
 
-    return _write_jobs(workspace, workspace.root / "batch" / "jobs", jobs)
+    return _write_jobs(run, run.workspace.root / "batch" / "jobs", jobs)
 
 
-def densify_stage(
-    workspace: Workspace, config: RunConfig, *, jobs: Mapping[str, Path], folder: Path, num_jobs: int
-) -> dict[str, str]:
+def densify_stage(run: Run, *, jobs: Mapping[str, Path], folder: Path, num_jobs: int) -> dict[str, str]:
     """Depth and normal maps of each job.
 
     Returns:
@@ -110,21 +108,21 @@ def densify_stage(
     Raises:
         CityReconError: the back-end can't run here.
     """
-    check_backend(config)
-    inventory = Inventory.read(workspace.inventory_file)
+    check_backend(run)
+    inventory = Inventory.read(run.workspace.inventory_file)
     num_workers, num_threads = split_cores(len(jobs), num_jobs)
     tasks = {
         name: Task(
             folder=folder / name,
-            options=_densify_options(config),
+            options=_densify_options(run),
             inputs=densify_inputs(job),
             arguments=(
                 job,
                 folder / name,
                 inventory.image_root,
                 inventory.mask_root,
-                config.densify,
-                config.stereo,
+                run.config.densify,
+                run.config.stereo,
                 num_threads,
             ),
             num_steps=len(DenseJob.read(job).images),
@@ -132,10 +130,10 @@ def densify_stage(
         for name, job in jobs.items()
     }
     _remove_strangers(folder, tasks)
-    return run_tasks("densify", densify_job, tasks, num_workers=num_workers, log_file=workspace.log_file)
+    return run_tasks("densify", densify_job, tasks, num_workers=num_workers, log_file=run.workspace.log_file)
 
 
-def check_backend(config: RunConfig) -> None:
+def check_backend(run: Run) -> None:
     """Refuse a back-end that doesn't exist or can't run, before hours of other work.
 
     Raises:
@@ -143,11 +141,11 @@ def check_backend(config: RunConfig) -> None:
         CityReconError: it can't run here.
     """
     try:
-        availability = get_backend(config.densify.backend).availability()
+        availability = get_backend(run.config.densify.backend).availability()
     except ValueError as error:
         raise InputError(str(error)) from error
     if not availability.ok:
-        raise CityReconError(f"back-end {config.densify.backend} can't run here: {availability.reason}")
+        raise CityReconError(f"back-end {run.config.densify.backend} can't run here: {availability.reason}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,40 +157,42 @@ class DensifyWork:
     megapixels: float
 
 
-def densify_work(config: RunConfig, *, jobs: Mapping[str, Path], folder: Path) -> DensifyWork:
+def densify_work(run: Run, *, jobs: Mapping[str, Path], folder: Path) -> DensifyWork:
     """What `densify_stage` would have to do."""
     todo = [
         DenseJob.read(job)
         for name, job in jobs.items()
-        if not is_current(folder / name, options=_densify_options(config), inputs=densify_inputs(job))
+        if not is_current(folder / name, options=_densify_options(run), inputs=densify_inputs(job))
     ]
     pixels = 0.0
     for job in todo:
         for image in job.images:
             camera = job.cameras[image.camera_id]
             longer = max(camera.width, camera.height)
-            scale = min(1.0, (config.densify.max_image_size_px or longer) / longer)
+            scale = min(1.0, (run.config.densify.max_image_size_px or longer) / longer)
             pixels += scale**2 * camera.width * camera.height
     return DensifyWork(
         num_jobs=len(todo), num_views=sum(len(job.images) for job in todo), megapixels=round(pixels / 1e6, 2)
     )
 
 
-def _densify_options(config: RunConfig) -> dict[str, object]:
-    return {"densify": config.densify, "stereo": config.stereo}
+def _densify_options(run: Run) -> dict[str, object]:
+    return {"densify": run.config.densify, "stereo": run.config.stereo}
 
 
 def fuse_stage(
-    workspace: Workspace,
-    config: RunConfig,
+    run: Run,
     *,
     jobs: Mapping[str, Path],
     dense: Path,
     folder: Path,
     out: Path,
     num_jobs: int,
+    allow_partial: bool,
 ) -> dict[str, str]:
     """A cloud of each job, cropped to its cells, and all of them in one file.
+
+    The file is written if all jobs succeed, or if ``allow_partial`` and some do.
 
     Returns:
         Reason of failure by name of the jobs that failed or have no depth maps.
@@ -201,16 +201,16 @@ def fuse_stage(
         CityReconError: no job left a point.
     """
     unfinished = {
-        name: "it has no depth maps; run `cityrecon densify` first"
-        for name in jobs
-        if StageRecord.read(dense / name) is None
+        name: "it has no depth maps for its present views and options; run `cityrecon densify` first"
+        for name, job in jobs.items()
+        if not is_current(dense / name, options=_densify_options(run), inputs=densify_inputs(job))
     }
     tasks = {
         name: Task(
             folder=folder / name,
-            options=config.fusion,
+            options=run.config.fusion,
             inputs=fuse_inputs(dense / name),
-            arguments=(job, dense / name, folder / name, config.fusion),
+            arguments=(job, dense / name, folder / name, run.config.fusion),
             num_steps=1,
         )
         for name, job in jobs.items()
@@ -218,19 +218,22 @@ def fuse_stage(
     }
     _remove_strangers(folder, tasks)
     failures = run_tasks(
-        "fuse", fuse_job, tasks, num_workers=split_cores(len(tasks), num_jobs)[0], log_file=workspace.log_file
+        "fuse", fuse_job, tasks, num_workers=split_cores(len(tasks), num_jobs)[0], log_file=run.workspace.log_file
     )
+    failures = unfinished | failures
+    if failures and not allow_partial:
+        return failures
     clouds = [folder / name / "cloud.ply" for name in sorted(tasks) if name not in failures]
     filled = [cloud for cloud in clouds if cloud.exists()]
     for cloud in clouds:
         if not cloud.exists():
             logger.warning("%s: empty, its views agreed on no point", cloud.parent.name)
     if not filled:
-        raise CityReconError(f"no cluster left a point, {out} not written; see {workspace.log_file}")
+        raise CityReconError(f"no cluster left a point, {out} not written; see {run.workspace.log_file}")
     with atomic_file(out) as partial:
         num_points = merge_clouds(filled, partial, progress=ProgressLine("merge"))
     logger.info("%s: %s points from %d of %d clusters", out, f"{num_points:,}", len(filled), len(jobs))
-    return unfinished | failures
+    return failures
 
 
 def _remove_strangers(folder: Path, tasks: Mapping[str, Task]) -> None:

@@ -11,11 +11,11 @@ from pathlib import Path
 
 from app.capture.capture import capture
 from app.capture.describe import describe
-from app.command_line import Run
 from app.comparison import compare_files
 from app.dense_stages import batch_jobs, check_backend, cluster_jobs, densify_stage, densify_work, fuse_stage
 from app.errors import CityReconError, InputError
 from app.log import format_seconds
+from app.run import Run
 from app.stage import RECORD, StageRecord
 from app.stages import (
     CaptureSources,
@@ -46,18 +46,18 @@ def full_pipeline(
     """
     start = time.monotonic()
     check_output(out)
-    check_backend(run.config)
+    check_backend(run)
     logger.info("workspace: %s", run.workspace.root)
     _announce(1, "capture: taking stock of the images")
-    capture_stage(run.workspace, sources, run.config)
+    capture_stage(run, sources)
     _announce(2, "sfm: finding poses and sparse points")
-    sfm_stage(run.workspace, run.config, model=model, poses=poses)
+    sfm_stage(run, model=model, poses=poses)
     _announce(3, "georegister: turning the model to z up and metres")
-    georegister_stage(run.workspace, run.config)
+    georegister_stage(run)
     _announce(4, "cluster: cutting the town into clusters")
-    cluster_stage(run.workspace, run.config)
+    cluster_stage(run)
     _announce(5, "select: choosing views")
-    select_stage(run.workspace, run.config, num_jobs=run.num_jobs)
+    select_stage(run)
     _announce(6, "densify: estimating depth and normal maps")
     densify_clusters(run, allow_partial=allow_partial)
     _announce(7, "fuse: depth maps to one cloud")
@@ -87,7 +87,7 @@ def plan_full(run: Run, sources: CaptureSources, *, out: Path) -> None:
         InputError: it couldn't begin.
     """
     check_output(out)
-    check_backend(run.config)
+    check_backend(run)
     with tempfile.TemporaryDirectory() as scratch:
         inventory = capture(
             sources.images,
@@ -131,27 +131,25 @@ def check_output(out: Path) -> None:
 
 def densify_clusters(run: Run, *, allow_partial: bool, dry_run: bool = False) -> None:
     """Depth and normal maps of every cluster, or how much work that is."""
-    jobs = cluster_jobs(run.workspace)
+    jobs = cluster_jobs(run)
     if dry_run:
         _log_work(run, jobs, run.workspace.root / "dense")
         return
-    failures = densify_stage(
-        run.workspace, run.config, jobs=jobs, folder=run.workspace.root / "dense", num_jobs=run.num_jobs
-    )
+    failures = densify_stage(run, jobs=jobs, folder=run.workspace.root / "dense", num_jobs=run.num_jobs)
     _check(failures, len(jobs), allow_partial=allow_partial)
 
 
 def fuse_clusters(run: Run, *, out: Path, allow_partial: bool) -> None:
     """One cloud of all clusters."""
-    jobs = cluster_jobs(run.workspace)
+    jobs = cluster_jobs(run)
     failures = fuse_stage(
-        run.workspace,
-        run.config,
+        run,
         jobs=jobs,
         dense=run.workspace.root / "dense",
         folder=run.workspace.root / "fused",
         out=out,
         num_jobs=run.num_jobs,
+        allow_partial=allow_partial,
     )
     _check(failures, len(jobs), allow_partial=allow_partial)
 
@@ -159,27 +157,25 @@ def fuse_clusters(run: Run, *, out: Path, allow_partial: bool) -> None:
 def batch_reconstruction(run: Run, *, out: Path, dry_run: bool = False) -> None:
     """One cloud of the whole set at once, or how much work that is."""
     folder = run.workspace.root / "batch"
-    jobs = batch_jobs(run.workspace)
+    jobs = batch_jobs(run)
     if dry_run:
         _log_work(run, jobs, folder / "dense")
         return
-    _check(
-        densify_stage(run.workspace, run.config, jobs=jobs, folder=folder / "dense", num_jobs=1), 1, allow_partial=False
-    )
+    _check(densify_stage(run, jobs=jobs, folder=folder / "dense", num_jobs=1), 1, allow_partial=False)
     failures = fuse_stage(
-        run.workspace,
-        run.config,
+        run,
         jobs=jobs,
         dense=folder / "dense",
         folder=folder / "fused",
         out=out,
         num_jobs=1,
+        allow_partial=False,
     )
     _check(failures, 1, allow_partial=False)
 
 
 def _log_work(run: Run, jobs: Mapping[str, Path], folder: Path) -> None:
-    work = densify_work(run.config, jobs=jobs, folder=folder)
+    work = densify_work(run, jobs=jobs, folder=folder)
     logger.info(
         "densify: %d of %d jobs to do, %d depth maps of %.1f megapixels in all with %s",
         work.num_jobs,

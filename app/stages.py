@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from app.capture.inventory import Inventory
-from app.config import RunConfig
 from app.executor import available_cores, split_cores
 from app.georegister.georeference import Georeference
 from app.log import ProgressLine
+from app.run import Run
 from app.stage import digest, digest_files, finished_product, run_stage
-from app.workspace import Workspace
 
 logger = logging.getLogger(__name__)
 
@@ -26,29 +25,30 @@ class CaptureSources:
     gps: Path | None = None
     rig: Path | None = None
     masks: Path | None = None
-    poses: Path | None = None
 
 
-def capture_stage(workspace: Workspace, sources: CaptureSources, config: RunConfig) -> str:
+def capture_stage(run: Run, sources: CaptureSources) -> None:
     """Take stock of the images, or extract frames from videos."""
     from app.capture.capture import capture
     from app.capture.describe import describe
+    from app.capture.poses import is_pose_file
 
     def work(partial: Path) -> None:
+        has_poses = sources.gps is not None and is_pose_file(sources.gps)
         capture(
             sources.images,
             partial,
-            options=config.capture,
-            gps_file=sources.gps,
-            pose_file=sources.poses,
+            options=run.config.capture,
+            gps_file=None if has_poses else sources.gps,
+            pose_file=sources.gps if has_poses else None,
             rig_file=sources.rig,
             mask_dir=sources.masks,
             progress=ProgressLine("capture"),
         )
 
-    product = run_stage(
-        workspace.root / "capture",
-        options=config.capture,
+    run_stage(
+        run.workspace.root / "capture",
+        options=run.config.capture,
         inputs={
             name: _listing_digest(path)
             for name, path in (
@@ -56,7 +56,6 @@ def capture_stage(workspace: Workspace, sources: CaptureSources, config: RunConf
                 ("GPS file", sources.gps),
                 ("rig file", sources.rig),
                 ("masks", sources.masks),
-                ("poses", sources.poses),
             )
         },
         work=work,
@@ -64,27 +63,26 @@ def capture_stage(workspace: Workspace, sources: CaptureSources, config: RunConf
             replace(Inventory.read(folder / "inventory.json"), image_root=Path(), mask_root=None)
         ),
     )
-    logger.info("%s", describe(Inventory.read(workspace.inventory_file)))
-    return product
+    logger.info("%s", describe(Inventory.read(run.workspace.inventory_file)))
 
 
-def sfm_stage(workspace: Workspace, config: RunConfig, *, model: Path | None, poses: Path | None) -> str:
+def sfm_stage(run: Run, *, model: Path | None, poses: Path | None) -> None:
     """Poses and sparse points: from the images, from an existing model, or from the images with known poses."""
     from app.sfm.imports import import_model
     from app.sfm.stage import run_sfm
 
-    inventory_product = finished_product(workspace.root / "capture", "capture")
-    inventory = Inventory.read(workspace.inventory_file)
+    inventory_product = finished_product(run.workspace.root / "capture", "capture")
+    inventory = Inventory.read(run.workspace.inventory_file)
 
     def work(partial: Path) -> None:
         if model is not None:
             import_model(model, partial, inventory=inventory)
         else:
-            run_sfm(inventory, partial, options=config.sfm, pose_file=poses, progress=ProgressLine("sfm"))
+            run_sfm(inventory, partial, options=run.config.sfm, pose_file=poses, progress=ProgressLine("sfm"))
 
-    return run_stage(
-        workspace.root / "sfm",
-        options=config.sfm,
+    run_stage(
+        run.workspace.root / "sfm",
+        options=run.config.sfm,
         inputs={
             "images": inventory_product,
             "imported model": digest_files([model]) if model else "none",
@@ -95,56 +93,59 @@ def sfm_stage(workspace: Workspace, config: RunConfig, *, model: Path | None, po
     )
 
 
-def georegister_stage(workspace: Workspace, config: RunConfig) -> str:
+def georegister_stage(run: Run) -> None:
     """Turn the model to z up, in metres, in ENU where GPS is known."""
     from app.georegister.georegister import georegister
 
-    inventory = Inventory.read(workspace.inventory_file)
-    model_product = finished_product(workspace.root / "sfm", "sfm")
-    inventory_product = finished_product(workspace.root / "capture", "capture")
-    return run_stage(
-        workspace.root / "georegister",
-        options=config.georegister,
+    inventory = Inventory.read(run.workspace.inventory_file)
+    model_product = finished_product(run.workspace.root / "sfm", "sfm")
+    inventory_product = finished_product(run.workspace.root / "capture", "capture")
+    run_stage(
+        run.workspace.root / "georegister",
+        options=run.config.georegister,
         inputs={"model": model_product, "images": inventory_product},
         work=lambda partial: georegister(
-            workspace.sfm_model, inventory, partial, options=config.georegister, rig_file=inventory.rig_file
+            run.workspace.sfm_model, inventory, partial, options=run.config.georegister, rig_file=inventory.rig_file
         ),
         product=lambda folder: digest_files([folder / "model", folder / "georeference.json"]),
     )
 
 
-def cluster_stage(workspace: Workspace, config: RunConfig) -> str:
+def cluster_stage(run: Run) -> None:
     """Cut the model into overlapping ground clusters ([O] section 3)."""
     from app.clustering.stage import cluster
 
-    model_product = finished_product(workspace.root / "georegister", "georegister")
-    georeference = Georeference.read(workspace.georeference_file)
-    return run_stage(
-        workspace.root / "clusters",
-        options=config.clustering,
+    model_product = finished_product(run.workspace.root / "georegister", "georegister")
+    georeference = Georeference.read(run.workspace.georeference_file)
+    run_stage(
+        run.workspace.root / "clusters",
+        options=run.config.clustering,
         inputs={"model": model_product},
         work=lambda partial: cluster(
-            workspace.georegistered_model, partial, options=config.clustering, units_per_m=georeference.units_per_m
+            run.workspace.georegistered_model,
+            partial,
+            options=run.config.clustering,
+            units_per_m=georeference.units_per_m,
         ),
         product=lambda folder: digest_files([folder / "clusters.jsonl"]),
     )
 
 
-def select_stage(workspace: Workspace, config: RunConfig, *, num_jobs: int) -> str:
+def select_stage(run: Run) -> None:
     """Choose the smallest set of views of each cluster that still sees and matches everything ([O] section 4)."""
     from app.view_selection.stage import select
 
-    clusters_product = finished_product(workspace.root / "clusters", "cluster")
-    return run_stage(
-        workspace.root / "selection",
-        options=config.selection,
+    clusters_product = finished_product(run.workspace.root / "clusters", "cluster")
+    run_stage(
+        run.workspace.root / "selection",
+        options=run.config.selection,
         inputs={"clusters": clusters_product},
         work=lambda partial: select(
-            workspace.georegistered_model,
-            workspace.root / "clusters",
+            run.workspace.georegistered_model,
+            run.workspace.root / "clusters",
             partial,
-            options=config.selection,
-            num_workers=split_cores(available_cores(), num_jobs)[0],
+            options=run.config.selection,
+            num_workers=split_cores(available_cores(), run.num_jobs)[0],
             progress=ProgressLine("select"),
         ),
         product=lambda folder: digest_files([folder / "selection.jsonl"]),

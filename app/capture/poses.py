@@ -58,6 +58,13 @@ class PoseFile:
         return self.format is not PoseFormat.COLMAP
 
 
+def is_pose_file(path: Path) -> bool:
+    """Whether a file's first line that isn't a comment looks like a pose, and not like a table of GPS positions."""
+    lines = (line.split() for line in read_text(path).splitlines() if line.strip() and not line.startswith("#"))
+    cells = next(lines, [])
+    return len(cells) >= 8 and all(_is_number(cell) for cell in cells[:8])
+
+
 def read_pose_file(path: Path) -> PoseFile:
     """Read poses.
 
