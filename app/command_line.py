@@ -64,8 +64,8 @@ def stage_command(
             common = common[1:]
 
         def command(**arguments: Any) -> None:
-            kept = {p.name: arguments.pop(p.name) for p in own if p.name != "workspace"}
-            path = arguments.pop("workspace")
+            path = arguments["workspace"]
+            kept = {p.name: arguments.pop(p.name) for p in own}
             if path is None:
                 path = default_workspace(kept["out"])
             settings = _settings(arguments, sections)

@@ -288,7 +288,9 @@ def _propose(kind, x, y, low, high, rate, draw, state, reference, search, scratc
     """Write the refinement hypothesis number `kind` of scratch.best into scratch.trial; False if there is none."""
     plane, out = scratch.best, scratch.trial
     w, a, b = plane[0], plane[1], plane[2]
-    shift = search.perturbation_px * (_TWO * uniform(draw) - _ONE) / rate
+    # Cubed: mostly small steps, now and then a large one, so one sweep refines at all scales.
+    step = _TWO * uniform(draw) - _ONE
+    shift = search.perturbation_px * step * step * step / rate
     height, width = state.cost.shape
     if kind == 0:
         # The slopes that the neighbours' depths imply: keeps normals consistent with the surface.

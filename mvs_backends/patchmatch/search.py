@@ -46,7 +46,7 @@ def window(options: PatchMatchOptions) -> Window:
         column=dx.astype(np.int64),
         row=dy.astype(np.int64),
         space_weight=np.exp(-(dx**2 + dy**2) / np.float32(2 * options.sigma_space_px**2)),
-        grey_weight=np.maximum(np.exp(-(grey**2) / np.float32(2 * options.sigma_grey**2)), np.float32(1e-4)),
+        grey_weight=np.maximum(np.exp(-(grey**2) / np.float32(2 * options.sigma_grey**2)), np.float32(1e-9)),
     )
 
 
