@@ -4,7 +4,7 @@
 
 TRUTH is a folder with `poses_gt.json`, `gt.ply`, `gt_mesh.ply` and, for errors in the world's own frame, `truth.json`,
 as `sample_data.render_street` writes them. Clouds are scored twice: as they are (georegistered, so the noise of the GPS
-counts), and after the rigid motion (no scale) that fits the cameras best, which leaves the errors of the reconstruction itself.
+counts), and after the rigid motion (no scale) that fits the cameras best, which leaves the reconstruction's own errors.
 Both sides are thinned to 5 cm voxels; accuracy is measured to the mesh, completeness to the samples of `gt.ply`.
 """
 
@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from app.georegister.georeference import Georeference
 from app.scene.read_model import read_posed_scene
+from benchmarks.alignment import Motion, fit_rigid, moved, position_errors
 from benchmarks.machine import describe_machine
-from fusion.cloud import PointCloud, read_ply
+from fusion.cloud import read_ply
 from fusion.compare import CompareOptions, compare_clouds
 
 
@@ -41,24 +41,23 @@ def main() -> None:
     }
     expected = np.array([truth[name] for name in scene.image_names])
     shift = _truth_from_world(arguments.workspace, arguments.truth)
-    fitted = _fit_rigid(scene.centers_in_world, expected)
+    fitted = fit_rigid(scene.centers_in_world, expected)
     print(f"registered images      {len(scene.image_names)} of {len(truth)}")
     figures: dict[str, object] = {"registered": len(scene.image_names), "images": len(truth)}
     frames = {"rigid fit": fitted} if shift is None else {"as georegistered": shift, "rigid fit": fitted}
-    for frame, (rotation, translation) in frames.items():
-        errors = np.linalg.norm(scene.centers_in_world @ rotation.T + translation - expected, axis=1)
+    for frame, motion in frames.items():
+        errors = 100 * position_errors(scene.centers_in_world, expected, motion)
         print(
-            f"position error, {frame:18} median {100 * np.median(errors):6.2f} cm, 95 % {100 * np.percentile(errors, 95):6.2f} cm"
+            f"position error, {frame:18} median {np.median(errors):6.2f} cm, 95 % {np.percentile(errors, 95):6.2f} cm"
         )
-        figures[f"median position error, {frame}, m"] = float(np.median(errors))
+        figures[f"median position error, {frame}, m"] = float(np.median(errors)) / 100
     reference = read_ply(arguments.truth / "gt.ply")
     print(f"\n{'cloud':24}{'frame':18}{'points':>12}" + "".join(f"{t:>20}" for t in ("5 cm", "10 cm", "20 cm")))
     for path in arguments.clouds:
         cloud = read_ply(path)
-        for frame, (rotation, translation) in frames.items():
-            moved = PointCloud((cloud.points @ rotation.T + translation).astype(np.float32))
+        for frame, motion in frames.items():
             comparison = compare_clouds(
-                moved,
+                moved(cloud, motion),
                 reference,
                 mesh=arguments.truth / "gt_mesh.ply",
                 options=CompareOptions(thresholds_m=(0.05, 0.1, 0.2)),
@@ -74,7 +73,7 @@ def main() -> None:
         arguments.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 
 
-def _truth_from_world(workspace: Path, truth: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+def _truth_from_world(workspace: Path, truth: Path) -> Motion | None:
     """Rotation and translation from the georegistered frame to the truth's, by the origins of both."""
     georeference = Georeference.read(workspace / "georegister" / "georeference.json")
     if georeference.origin_deg_m is None or not (truth / "truth.json").exists():
@@ -85,16 +84,6 @@ def _truth_from_world(workspace: Path, truth: Path) -> tuple[NDArray[np.float64]
     geodetic = np.array(transform.enu_to_ellipsoid(corners, *georeference.origin_deg_m))
     moved = np.array(transform.ellipsoid_to_enu(geodetic, *origin))
     return (moved[1:] - moved[0]).T / 100, moved[0]
-
-
-def _fit_rigid(
-    source: NDArray[np.float64], target: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Least-squares rotation and translation (Kabsch 1976)."""
-    center_source, center_target = source.mean(axis=0), target.mean(axis=0)
-    u, _, vt = np.linalg.svd((target - center_target).T @ (source - center_source))
-    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return rotation, center_target - rotation @ center_source
 
 
 if __name__ == "__main__":

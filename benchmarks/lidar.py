@@ -1,0 +1,64 @@
+"""Judge a run by LiDAR scans.
+
+    python -m benchmarks.lidar WORKSPACE CLOUD.ply POSITIONS.json LIDAR.npz
+
+POSITIONS holds `{image name: [x, y, z]}` of true camera positions, LIDAR an array `xyz` (N, 3), both in one metric frame.
+The cloud is moved there by the rigid motion (no scale) that fits the cameras best. LiDAR scans are sparse and see less than
+the cameras: accuracy counts only those points of the cloud that lie within 50 cm of a LiDAR point, and their share is
+printed; completeness counts LiDAR points within a range of the cameras.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+
+from app.scene.read_model import read_posed_scene
+from benchmarks.alignment import fit_rigid, moved, position_errors
+from benchmarks.machine import describe_machine
+from fusion.cloud import PointCloud, read_ply
+from fusion.compare import cloud_distances
+from fusion.thinning import thin
+
+_NEAR_LIDAR_M = 0.5
+_THRESHOLDS_M = (0.05, 0.1, 0.2, 0.5)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("workspace", type=Path)
+    parser.add_argument("cloud", type=Path)
+    parser.add_argument("positions", type=Path)
+    parser.add_argument("lidar", type=Path)
+    parser.add_argument("--range-m", type=float, default=25.0)
+    arguments = parser.parse_args()
+    print(describe_machine(), end="\n\n")
+    scene = read_posed_scene(arguments.workspace / "georegister" / "model")
+    truth = json.loads(arguments.positions.read_text(encoding="utf-8"))
+    known = np.array([name in truth for name in scene.image_names])
+    expected = np.array([truth[name] for name in scene.image_names if name in truth])
+    motion = fit_rigid(scene.centers_in_world[known], expected)
+    errors = position_errors(scene.centers_in_world[known], expected, motion)
+    print(f"registered images   {len(scene.image_names)} of {len(truth)}")
+    print(f"position error      median {100 * np.median(errors):.1f} cm, 95 % {100 * np.percentile(errors, 95):.1f} cm")
+    cloud = thin(moved(read_ply(arguments.cloud), motion), 0.05).points
+    scans = thin(PointCloud(np.load(arguments.lidar)["xyz"].astype(np.float32)), 0.05).points
+    scans = scans[cloud_distances(scans, expected.astype(np.float32)) <= arguments.range_m]
+    to_lidar, to_cloud = cloud_distances(cloud, scans), cloud_distances(scans, cloud)
+    near = to_lidar <= _NEAR_LIDAR_M
+    print(f"points (5 cm voxels) cloud {len(cloud):,}, LiDAR within {arguments.range_m:g} m {len(scans):,}")
+    print(
+        f"of the cloud within {_NEAR_LIDAR_M:g} m of LiDAR {100 * near.mean():.1f} %; their median distance "
+        f"{100 * np.median(to_lidar[near]):.1f} cm"
+    )
+    print("within               " + "".join(f"{100 * t:>8g} cm" for t in _THRESHOLDS_M))
+    print("accuracy             " + "".join(f"{100 * (to_lidar[near] <= t).mean():>9.1f} %" for t in _THRESHOLDS_M))
+    print("completeness         " + "".join(f"{100 * (to_cloud <= t).mean():>9.1f} %" for t in _THRESHOLDS_M))
+
+
+if __name__ == "__main__":
+    main()
