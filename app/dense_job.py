@@ -50,7 +50,7 @@ class JobImage:
     image_id: int
     camera_id: int
     digest: str
-    """Of the file, so that a changed image is noticed."""
+    """Of the image and its mask, so that a change is noticed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +93,7 @@ def write_dense_job(
         image_rows: rows of the scene's images that take part.
         region: what to reconstruct.
         cameras: the model's cameras before undistortion, one per row of the scene's cameras.
-        digests: of image files, by name.
+        digests: of images and masks, by image name.
     """
     rows = np.asarray(sorted(image_rows), dtype=np.int64)
     low, high = region.padded_boxes()[:, 0].min(axis=0), region.padded_boxes()[:, 1].max(axis=0)

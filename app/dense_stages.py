@@ -40,7 +40,10 @@ def _write_jobs(
     def work(partial: Path) -> None:
         scene = read_posed_scene(run.workspace.georegistered_model)
         cameras = pycolmap.Reconstruction(str(run.workspace.georegistered_model)).cameras
-        digests = {image.name: image.digest for image in Inventory.read(run.workspace.inventory_file).images}
+        digests = {
+            image.name: image.digest + image.mask_digest
+            for image in Inventory.read(run.workspace.inventory_file).images
+        }
         row_of_name = {name: row for row, name in enumerate(scene.image_names)}
         for name, (image_names, region) in jobs().items():
             remove_tree(partial / name)

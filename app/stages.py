@@ -59,9 +59,7 @@ def capture_stage(run: Run, sources: CaptureSources) -> None:
             )
         },
         work=work,
-        product=lambda folder: digest(
-            replace(Inventory.read(folder / "inventory.json"), image_root=Path(), mask_root=None)
-        ),
+        product=lambda folder: _inventory_digest(Inventory.read(folder / "inventory.json")),
     )
     logger.info("%s", describe(Inventory.read(run.workspace.inventory_file)))
 
@@ -149,6 +147,14 @@ def select_stage(run: Run) -> None:
             progress=ProgressLine("select"),
         ),
         product=lambda folder: digest_files([folder / "selection.jsonl"]),
+    )
+
+
+def _inventory_digest(inventory: Inventory) -> str:
+    """Hash of what was captured, wherever it lies."""
+    return digest(
+        replace(inventory, image_root=Path(), mask_root=None, rig_file=None),
+        digest_files([inventory.rig_file]) if inventory.rig_file else "none",
     )
 
 

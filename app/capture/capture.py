@@ -12,7 +12,7 @@ from pathlib import Path
 import pycolmap
 
 from app.capture.gps import GpsTable, assign_gps, mean_position, read_gps_file
-from app.capture.image_check import ImageProbe, check_images, png_size
+from app.capture.image_check import ImageProbe, check_images, image_digest, png_size
 from app.capture.inventory import CameraEntry, FrameEntry, ImageEntry, Inventory
 from app.capture.poses import PoseFile, match_poses, read_pose_file
 from app.capture.rig import check_prefixes, read_rig_file
@@ -129,7 +129,7 @@ def capture(
     cameras = _cameras(source, root, probes)
     is_rig = _is_rig([camera.name for camera in cameras], names, options.rig, rig_file)
     frames = _with_positions(_frames(probes, is_rig, times_s), gps, poses)
-    masks = _check_masks(mask_dir, probes) if mask_dir else set()
+    masks = _check_masks(mask_dir, probes) if mask_dir else {}
     inventory = Inventory(
         image_root=root,
         cameras=cameras,
@@ -147,9 +147,9 @@ def capture(
     return inventory
 
 
-def _images(probes: Mapping[str, ImageProbe], masks: set[str]) -> tuple[ImageEntry, ...]:
+def _images(probes: Mapping[str, ImageProbe], masks: Mapping[str, str]) -> tuple[ImageEntry, ...]:
     return tuple(
-        ImageEntry(name=name, size_bytes=probe.size_bytes, digest=probe.digest, has_mask=name in masks)
+        ImageEntry(name=name, size_bytes=probe.size_bytes, digest=probe.digest, mask_digest=masks.get(name, ""))
         for name, probe in sorted(probes.items())
     )
 
@@ -312,21 +312,22 @@ def _with_positions(
     return frames
 
 
-def _check_masks(mask_dir: Path, probes: Mapping[str, ImageProbe]) -> set[str]:
-    """Names of the images with a mask."""
-    found = set()
+def _check_masks(mask_dir: Path, probes: Mapping[str, ImageProbe]) -> dict[str, str]:
+    """Hash of the mask of each image that has one, by the image's name."""
+    found = {}
     for name, probe in probes.items():
         path = mask_dir / f"{name}.png"
         try:
-            size = png_size(path)
+            data = path.read_bytes()
         except FileNotFoundError:
             continue
         except OSError as error:
             raise InputError(f"cannot read mask {path}: {error.strerror}; check its permissions") from error
+        size = png_size(data)
         if size != (probe.width, probe.height):
             what = "is no PNG file" if size is None else f"has {size[0]}x{size[1]} pixels"
             raise InputError(f"mask {path} {what}; its image has {probe.width}x{probe.height}; correct or remove it")
-        found.add(name)
+        found[name] = image_digest(data)
     first = next(iter(probes))
     if not found:
         raise InputError(f"no image has a mask in {mask_dir}; the mask of {first} must be {mask_dir / first}.png")

@@ -47,9 +47,14 @@ class ImageEntry:
     name: str
     size_bytes: int
     digest: str
-    """Hash of size and first 64 KiB: tells changed images without reading them all."""
-    has_mask: bool = False
-    """There is a mask `mask_root/NAME.png` of the same size."""
+    """Hash of the file."""
+    mask_digest: str = ""
+    """Hash of the mask `mask_root/NAME.png`; empty when there is none."""
+
+    @property
+    def has_mask(self) -> bool:
+        """Whether parts of the image are to be ignored."""
+        return self.mask_digest != ""
 
 
 @dataclass(frozen=True, kw_only=True)
