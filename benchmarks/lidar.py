@@ -2,10 +2,10 @@
 
     python -m benchmarks.lidar WORKSPACE CLOUD.ply POSITIONS.json LIDAR.npz
 
-POSITIONS holds `{image name: [x, y, z]}` of true camera positions, LIDAR an array `xyz` (N, 3), both in one metric frame.
-The cloud is moved there by the rigid motion (no scale) that fits the cameras best. LiDAR scans are sparse and see less than
-the cameras: accuracy counts only those points of the cloud that lie within 50 cm of a LiDAR point, and their share is
-printed; completeness counts LiDAR points within a range of the cameras.
+POSITIONS holds `{image name: [x, y, z]}` of true camera positions, LIDAR an array `xyz` (N, 3), both in one metric
+frame. The cloud is moved there by the rigid motion (no scale) that fits the cameras best. LiDAR scans are sparse and
+see less than the cameras. Accuracy counts only those points of the cloud that lie within 50 cm of a LiDAR point, and
+their share is printed; completeness counts LiDAR points within a range of the cameras.
 """
 
 from __future__ import annotations

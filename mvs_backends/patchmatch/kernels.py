@@ -34,6 +34,8 @@ _TWO = np.float32(2)
 _TINY = np.float32(1e-12)
 _NUM_AREAS = 8
 _MIN_FACING = np.float32(0.1)
+# Of a plane that no texture confirms: worse than any that the prior may be made from, good enough to be kept.
+_PRIOR_COST = np.float32(0.5)
 _GOOD_COST = np.float32(0.8)
 _GOOD_COST_DECAY = np.float32(90)
 _BAD_COST = np.float32(1.2)
@@ -325,10 +327,10 @@ def _propose(kind, x, y, low, high, rate, draw, state, reference, search, scratc
 
 
 @njit(forceinline=True, **COMPILED)
-def _prior_wins(x, y, state, reference):
-    """Without texture only the prior knows."""
-    state.cost[y, x] = MAX_COST
+def _take_prior(x, y, state, reference):
+    """Without texture only the prior knows; what a coarser level took from it stays."""
     if reference.prior.shape[0] > 0 and reference.prior[y, x, 0] > _ZERO:
+        state.cost[y, x] = _PRIOR_COST
         for i in range(3):
             state.plane[y, x, i] = reference.prior[y, x, i]
 
@@ -414,7 +416,7 @@ def sweep_rows(first_row, last_row, colour, state, reference, sources, window, s
                 continue
             variance = sample_reference(reference.padded_grey, x, y, window, scratch.weight, scratch.centred)
             if variance < MIN_VARIANCE:
-                _prior_wins(x, y, state, reference)
+                _take_prior(x, y, state, reference)
             else:
                 _update_pixel(x, y, variance, state, reference, sources, window, search, scratch)
 

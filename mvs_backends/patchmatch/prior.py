@@ -6,9 +6,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+_MAX_GREY_STEP = 25
+
 
 def interpolated_planes(
-    points: NDArray[np.float32], inverse_depths: NDArray[np.float32], width: int, height: int
+    points: NDArray[np.float32],
+    inverse_depths: NDArray[np.float32],
+    width: int,
+    height: int,
+    grey: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.float32]:
     """Planes through the Delaunay triangles of points in the image.
 
@@ -17,6 +23,8 @@ def interpolated_planes(
         inverse_depths: (P,)
         width: of the image.
         height: of the image.
+        grey: (height, width) the image. If given, pixels whose grey value differs from all three corners of their
+            triangle by more than 25 get no plane: between two houses that is the sky.
 
     Returns:
         (height, width, 3) inverse depth and its slopes along x and y; 0 outside the points' convex hull.
@@ -53,6 +61,10 @@ def interpolated_planes(
     planes[y, x, 1], planes[y, x, 2] = slope_x[at], slope_y[at]
     planes[y, x, 0] = values[at, 0] + slope_x[at] * (x - corners[at, 0, 0]) + slope_y[at] * (y - corners[at, 0, 1])
     planes[planes[..., 0] <= 0] = 0.0
+    if grey is not None:
+        at_corners = grey[corners[:, :, 1], corners[:, :, 0]].astype(np.int32)[at]
+        alike = np.abs(at_corners - grey[y, x].astype(np.int32)[:, None]).min(axis=1) <= _MAX_GREY_STEP
+        planes[y[~alike], x[~alike]] = 0.0
     return planes
 
 

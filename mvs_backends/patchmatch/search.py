@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mvs_backends.base import MvsJob
 from mvs_backends.depth_range import depth_range
-from mvs_backends.patchmatch.cost.kernels import Reference, Sources, Window, new_scratch
+from mvs_backends.patchmatch.cost.kernels import PADDING, Reference, Sources, Window, new_scratch
 from mvs_backends.patchmatch.geometry import LevelCamera, level_camera, warp
 from mvs_backends.patchmatch.images import ImageCache
 from mvs_backends.patchmatch.kernels import Search, State, initialise_rows, sweep_rows
@@ -206,7 +206,8 @@ class LevelSearch:
         points, inverse_depths = support_points(
             found.cost, found.plane[..., 0], self.options.prior_cell_px, self.options.max_prior_cost
         )
-        prior = interpolated_planes(points, inverse_depths, width, height)
+        grey = self.reference.padded_grey[PADDING:-PADDING, PADDING:-PADDING]
+        prior = interpolated_planes(points, inverse_depths, width, height, grey)
         low, high = np.moveaxis(self.reference.inverse_range, -1, 0)
         prior[(prior[..., 0] < low) | (prior[..., 0] > high)] = 0.0
         return LevelSearch(

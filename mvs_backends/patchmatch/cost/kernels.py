@@ -26,8 +26,8 @@ NUM_CANDIDATES = 10
 """Hypotheses compared at a pixel at once: its own, 8 neighbours' and the planar prior's."""
 MAX_COST = np.float32(2)
 """Cost 1 - NCC of a perfect anti-correlation; also of a view that doesn't see the patch."""
-MIN_VARIANCE = np.float32(0.6)
-"""Patches of less variance (grey values squared) have no texture."""
+MIN_VARIANCE = np.float32(2)
+"""Patches of less variance (grey values squared) have no texture: noise, or the sky's gradient."""
 
 COMPILED: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "_nrt": False}
 """How all kernels of this back-end are compiled, those called from Python with `cache=True` on top.
@@ -37,6 +37,7 @@ of a cost. So nothing may be allocated in a kernel.
 """
 
 _ZERO = np.float32(0)
+_QUARTER = np.float32(0.25)
 _HALF = np.float32(0.5)
 _ONE = np.float32(1)
 _TWO = np.float32(2)
@@ -244,7 +245,7 @@ def view_cost(j, pixel_x, pixel_y, w, a, b, variance, sources, window, scratch):
         s2 += ws * s
         s3 += centred[i] * s
     spread = s2 - s1 * s1
-    if spread < _HALF * MIN_VARIANCE:
+    if spread < _QUARTER * MIN_VARIANCE:
         return MAX_COST
     return min(max(_ONE - s3 / np.sqrt(variance * spread), _ZERO), MAX_COST)
 
