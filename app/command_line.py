@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import logging
+import signal
 import sys
 import time
 import types
@@ -92,6 +93,8 @@ def run_safely(work: Callable[[], None], *, verbosity: int) -> None:
     """Do a command's work; errors become one line on stderr and an exit code."""
     log_to_console(verbosity)
     sys.excepthook = _report_bug
+    # Loading pycolmap installs a handler that answers SIGTERM with a stack trace.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         work()
     except CityReconError as error:

@@ -36,7 +36,10 @@ def diagnose() -> str:
         "packages",
     ]
     for distribution, module in _PACKAGES:
-        lines.append(f"  {distribution:24}{_version(distribution):14}{_import_problem(module) or 'works'}")
+        problem = _import_problem(module)
+        if problem is not None and module == "open3d":
+            problem += " (only `compare` needs it)"
+        lines.append(f"  {distribution:24}{_version(distribution):14}{problem or 'works'}")
     lines += ["", "dense back-ends"]
     for name in BACKEND_NAMES:
         availability = get_backend(name).availability()

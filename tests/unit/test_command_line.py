@@ -76,3 +76,12 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, arguments: lis
     assert complaint in errors[0]
     assert "Traceback" not in result.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["empty"]
+
+
+def test_a_terminated_run_says_so_in_one_line() -> None:
+    script = "import os, signal, time, typer; from app.command_line import run_safely; import pycolmap\n"
+    script += "def work():\n    os.kill(os.getpid(), signal.SIGTERM)\n    time.sleep(60)\n"
+    script += "app = typer.Typer()\napp.command()(lambda: run_safely(work, verbosity=0))\napp([])"
+    result = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True, cwd=ROOT)
+    assert result.returncode == 130
+    assert result.stderr == "warning: stopped; the same command continues\n"
