@@ -112,11 +112,14 @@ def capture(
 
 
 @stage_command(app, "sfm")
-def sfm(run: Run, poses: PosesOption = None, model: ImportOption = None) -> None:
+def sfm(run: Run, poses: PosesOption = None, model: ImportOption = None, dry_run: DryRunOption = False) -> None:
     """Find poses and sparse points (Structure-from-Motion), or import them."""
-    from app.stages import sfm_stage
+    from app.stages import plan_sfm, sfm_stage
 
-    sfm_stage(run, model=model, poses=poses)
+    if dry_run:
+        plan_sfm(run)
+    else:
+        sfm_stage(run, model=model, poses=poses)
 
 
 @stage_command(app, "georegister")

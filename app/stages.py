@@ -91,6 +91,24 @@ def sfm_stage(run: Run, *, model: Path | None, poses: Path | None) -> None:
     )
 
 
+def plan_sfm(run: Run) -> None:
+    """Say how much work `sfm_stage` has with the images."""
+    from app.sfm.pairs import image_pairs
+
+    finished_product(run.workspace.root / "capture", "capture")
+    inventory = Inventory.read(run.workspace.inventory_file)
+    pairs = image_pairs(inventory, run.config.sfm)
+    strategies = ", ".join(run.config.sfm.strategies)
+    logger.info(
+        "sfm: features of %d images, %d pairs to match (and more where places look alike), then mapping by the first of"
+        " these that registers %.0f %%: %s",
+        len(inventory.images),
+        len(pairs),
+        100 * run.config.sfm.min_registered_ratio,
+        strategies,
+    )
+
+
 def georegister_stage(run: Run) -> None:
     """Turn the model to z up, in metres, in ENU where GPS is known."""
     from app.georegister.georegister import georegister
