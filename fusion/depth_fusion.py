@@ -18,8 +18,8 @@ class FusionOptions:
     """When depth maps of several views agree on a point; names as in COLMAP's stereo fusion."""
 
     min_num_pixels: int = 2
-    """Views that must agree on a point. Two, since selection leaves little redundancy and the maps are filtered already:
-    on the sample street, three lose 13 points of completeness at 20 cm for 0.3 points of accuracy."""
+    """Views that must agree on a point. Two, since selection leaves little redundancy and the maps are filtered
+    already: on the sample street, three lose 13 points of completeness at 20 cm for 0.3 points of accuracy."""
     max_reproj_error_px: float = 2.0
     """Largest distance between a pixel and the reprojection of its neighbour view's point."""
     max_depth_error: float = 0.01
