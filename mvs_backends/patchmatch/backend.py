@@ -14,10 +14,10 @@ from typing import ClassVar
 
 import cv2
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from mvs_backends.base import Availability, MvsBackend, MvsError, MvsJob, MvsOptions, Progress
+from mvs_backends.colmap_maps import write_map
 from mvs_backends.patchmatch.cost.kernels import PADDING, Reference
 from mvs_backends.patchmatch.geometry import LevelCamera, depth_and_normal, level_camera
 from mvs_backends.patchmatch.images import ImageCache
@@ -199,14 +199,12 @@ def _write_maps(job: MvsJob, view: int, found: Hypotheses, options: PatchMatchOp
     plane[~(found.cost <= options.max_cost)] = 0.0
     plane[_speckles(plane[..., 0], options.min_speckle_px)] = 0.0
     depth, normal = depth_and_normal(plane, level_camera(job.views[view], 0).calibration)
-    known = depth[depth > 0]
-    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
     depth_path, normal_path = job.depth_map_path(view), job.normal_map_path(view)
     depth_partial, normal_partial = (p.with_name(f".{p.name}.partial") for p in (depth_path, normal_path))
     for path in (depth_path, normal_path):
         path.parent.mkdir(parents=True, exist_ok=True)
-    pycolmap.DepthMap.from_array(depth, depth_min=low, depth_max=high).write(depth_partial)
-    pycolmap.NormalMap.from_array(normal).write(normal_partial)
+    write_map(depth_partial, depth)
+    write_map(normal_partial, normal)
     normal_partial.replace(normal_path)
     depth_partial.replace(depth_path)
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pycolmap
 import pytest
 from numpy.typing import NDArray
 
@@ -15,6 +14,7 @@ from mvs_backends import BACKEND_NAMES, get_backend
 from mvs_backends.base import MvsError, MvsJob, MvsOptions, Preset
 from mvs_backends.patchmatch.backend import estimate_maps
 from mvs_backends.patchmatch.options import PatchMatchOptions
+from tests.reference.colmap_maps import read_map
 from tests.reference.plane_scene import plane_job, true_depth
 
 OPTIONS = MvsOptions()
@@ -28,13 +28,7 @@ def run(job: MvsJob, *, num_threads: int = 2, options: MvsOptions = OPTIONS) -> 
 
 
 def maps(job: MvsJob) -> list[tuple[NDArray, NDArray]]:
-    found = []
-    for view in range(len(job.views)):
-        depth, normal = pycolmap.DepthMap(), pycolmap.NormalMap()
-        depth.read(job.depth_map_path(view))
-        normal.read(job.normal_map_path(view))
-        found.append((depth.to_array(), normal.to_array()))
-    return found
+    return [(read_map(job.depth_map_path(v)), read_map(job.normal_map_path(v))) for v in range(len(job.views))]
 
 
 def map_bytes(job: MvsJob) -> list[bytes]:
