@@ -18,9 +18,8 @@ _PACKAGES = (
     ("numpy", "numpy"),
     ("numba", "numba"),
     ("opencv-python-headless", "cv2"),
-    ("ortools", "ortools.sat.python.cp_model"),
+    ("ortools", "ortools.linear_solver.python.model_builder"),
     ("pycolmap", "pycolmap"),
-    ("trimesh", "trimesh"),
     ("open3d", "open3d"),
 )
 

@@ -92,6 +92,13 @@ def test_every_dependency_has_a_lower_and_an_upper_bound() -> None:
         assert ">=" in requirement and re.search(r"<[\d.]+$", requirement), requirement
 
 
+def test_every_dependency_is_used() -> None:
+    provides = {"opencv-python-headless": "cv2"}
+    used = {name.split(".")[0] for path in SHIPPED for name in all_imports(path)} | {"open3d"}
+    needed = {re.split("[<>]", one)[0] for one in PROJECT["project"]["dependencies"]}
+    assert {provides.get(name, name) for name in needed} <= used
+
+
 @pytest.mark.parametrize("package", PACKAGES)
 def test_a_package_is_marked_as_typed(package: str) -> None:
     assert (ROOT / package / "py.typed").exists()
