@@ -7,9 +7,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from numpy.typing import NDArray
 
+from fusion.cloud import read_ply
 from mvs_backends import BACKEND_NAMES, get_backend
 from mvs_backends.base import MvsError, MvsJob, MvsOptions, Preset
 from mvs_backends.patchmatch.backend import estimate_maps
@@ -167,6 +169,9 @@ def test_colmap_fuses_the_maps(tmp_path: Path) -> None:
     assert len(points) > 800
     direction = np.asarray(SLANTED) / np.linalg.norm(SLANTED)
     assert np.percentile(np.abs(points @ direction - 5.0), 90) < 0.02
+    normals = read_ply(tmp_path / "fused.ply").normals
+    assert normals is not None
+    assert np.median(-normals @ direction) > 0.99
 
 
 def test_view_without_sources_gets_an_empty_map(tmp_path: Path) -> None:
