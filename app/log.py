@@ -21,7 +21,7 @@ def log_to_console(verbosity: int) -> None:
 
 def log_to_file(path: Path) -> None:
     """Append every record, with tracebacks, to a file."""
-    handler = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
+    handler = _LogFile(path, encoding="utf-8", errors="backslashreplace")
     handler.setFormatter(logging.Formatter(_FILE_FORMAT))
     _add(handler)
 
@@ -30,6 +30,13 @@ def _add(handler: logging.Handler) -> None:
     for name in _PACKAGES:
         logging.getLogger(name).setLevel(logging.DEBUG)
         logging.getLogger(name).addHandler(handler)
+
+
+class _LogFile(logging.FileHandler):
+    """Where a full disk, which the work itself reports, adds no tracebacks to the console."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Lose the record."""
 
 
 class _ConsoleFormatter(logging.Formatter):
