@@ -252,34 +252,37 @@ def view_cost(j, pixel_x, pixel_y, w, a, b, variance, sources, window, scratch):
 
 @njit(forceinline=True, **COMPILED)
 def geometric_error(j, x, y, w, sources, cap):
-    """Forward-backward reprojection error in pixels of the reference view, at most `cap` ([X] ACMM eq. 10)."""
+    """Forward-backward reprojection error e in reference pixels, at most `cap` (ACMM section 4), as e^2 / (1 + e).
+
+    Flat at 0, unlike ACMM's: the maps of the pass before, half as fine, must not pull the depth within a pixel.
+    """
+    worst = cap * cap / (_ONE + cap)
     t = sources.to_map[j]
     fx, fy = np.float32(x), np.float32(y)
     z = t[6] * fx + t[7] * fy + t[8] + t[11] * w
     if z <= _TINY:
-        return cap
+        return worst
     z = _ONE / z
     mx = (t[0] * fx + t[1] * fy + t[2] + t[9] * w) * z
     my = (t[3] * fx + t[4] * fy + t[5] + t[10] * w) * z
     width, height = sources.plane_size[j, 0], sources.plane_size[j, 1]
     if mx < -_HALF or my < -_HALF or mx > np.float32(width) - _HALF or my > np.float32(height) - _HALF:
-        return cap
+        return worst
     ix, iy = min(np.int32(mx + _HALF), width - 1), min(np.int32(my + _HALF), height - 1)
     index = sources.plane_first[j] + np.uint64(iy * width + ix)
     there = sources.planes[index, 0]
     if there <= _ZERO:
-        return cap
+        return worst
     # The source's own plane, not the nearest pixel's depth: on a slanted road the two differ by more than the cap.
     there += sources.planes[index, 1] * (mx - np.float32(ix)) + sources.planes[index, 2] * (my - np.float32(iy))
     r = sources.from_map[j]
     z = r[6] * mx + r[7] * my + r[8] + r[11] * there
     if z <= _TINY:
-        return cap
+        return worst
     z = _ONE / z
     ex = (r[0] * mx + r[1] * my + r[2] + r[9] * there) * z - fx
     ey = (r[3] * mx + r[4] * my + r[5] + r[10] * there) * z - fy
     error = min(np.sqrt(ex * ex + ey * ey), cap)
-    # Flat at 0, unlike ACMM's: the maps of the pass before, half as fine, must not pull the depth within a pixel.
     return error * error / (_ONE + error)
 
 
