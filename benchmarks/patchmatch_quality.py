@@ -1,0 +1,126 @@
+"""Time and quality of the embedded stereo back-end on a rendered street, by ingredient.
+
+    python -m benchmarks.patchmatch_quality TRUTH MODEL WORK --frames 4-8 --set prior_iterations=0
+
+TRUTH is a folder as `sample_data.render_street` writes it (`images`, `gt.ply`, `gt_mesh.ply`), MODEL a COLMAP model of
+it in the same world, WORK a folder to work in. Each `--set` is one run with `PatchMatchOptions` of the preset but for the
+fields named (`a=1;b=2`); the preset itself runs first. `region=...` is special: side of the square in metres around the
+cameras that is reconstructed. Time is CPU-seconds, user and system, of the depth maps alone, with the kernels compiled
+before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import dataclasses
+import logging
+import resource
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from app.dense_job import prepare_workspace, write_dense_job
+from app.scene.read_model import read_posed_scene
+from benchmarks.machine import describe_machine
+from fusion.cloud import read_ply
+from fusion.compare import CompareOptions, compare_clouds
+from fusion.depth_fusion import FusionOptions, fuse_depth_maps
+from fusion.region import GroundRegion
+from mvs_backends.base import MvsJob, Preset
+from mvs_backends.patchmatch.backend import estimate_maps
+from mvs_backends.patchmatch.options import PRESETS, PatchMatchOptions
+
+
+def main() -> None:
+    """Print one row per setting."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("truth", type=Path)
+    parser.add_argument("model", type=Path)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--frames", default="0-9999", help="first-last, by file name")
+    parser.add_argument("--max-image-size", type=int, default=0)
+    parser.add_argument("--preset", type=Preset, default=Preset.NORMAL)
+    parser.add_argument("--set", action="append", default=[], dest="settings")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--min-num-pixels", type=int, default=FusionOptions().min_num_pixels)
+    arguments = parser.parse_args()
+    logging.basicConfig(level=logging.WARNING)
+    print(describe_machine(), end="\n\n")
+    first, last = (int(part) for part in arguments.frames.split("-"))
+    print(
+        "| setting | CPU-s/MP | points | accuracy/completeness/F at 2 cm | 5 cm | 10 cm | 20 cm |\n|---|---|---|---|---|---|---|"
+    )
+    for number, setting in enumerate(["", *arguments.settings]):
+        changes = {key: ast.literal_eval(value) for key, value in _pairs(setting)}
+        side_m = float(changes.pop("region", 0.0))
+        options = dataclasses.replace(PRESETS[arguments.preset], **changes)
+        job = _job(arguments, range(first, last + 1), side_m)
+        if number == 0:
+            _compile(job, options)
+        shutil.rmtree(job.workspace / "stereo" / "depth_maps")
+        (job.workspace / "stereo" / "depth_maps").mkdir()
+        started = _cpu_seconds()
+        estimate_maps(job=job, options=options, seed=0, num_threads=arguments.threads)
+        cost = (_cpu_seconds() - started) / (sum(v.width * v.height for v in job.views) / 1e6)
+        box = np.array([[-1e9] * 3, [1e9] * 3])
+        fusion = FusionOptions(min_num_pixels=arguments.min_num_pixels)
+        cloud = fuse_depth_maps(job.workspace, job.workspace / "fused.ply", options=fusion, bounds=box)
+        found = compare_clouds(
+            cloud,
+            read_ply(arguments.truth / "gt.ply"),
+            mesh=arguments.truth / "gt_mesh.ply",
+            options=CompareOptions(thresholds_m=(0.02, 0.05, 0.1, 0.2)),
+        )
+        cells = [f"{100 * s.accuracy:.1f}/{100 * s.completeness:.1f}/{100 * s.f_score:.1f}" for s in found.scores]
+        print(f"| {setting or 'preset'} | {cost:.1f} | {len(cloud):,} | {' | '.join(cells)} |", flush=True)
+
+
+def _pairs(setting: str) -> list[tuple[str, str]]:
+    # Tuples hold commas themselves, so fields are separated by ';'.
+    return [(key, value) for key, _, value in (part.partition("=") for part in setting.split(";") if part)]
+
+
+def _job(arguments: argparse.Namespace, frames: range, side_m: float) -> MvsJob:
+    """The dense workspace of the wanted frames; the region is a square around the cameras, or the sparse points."""
+    scene = read_posed_scene(arguments.model)
+    rows = [i for i, name in enumerate(scene.image_names) if int(Path(name).stem) in frames]
+    low, high = np.percentile(scene.points_in_world, [0.5, 99.5], axis=0)
+    corner, size = low[:2], high[:2] - low[:2]
+    if side_m:
+        corner, size = scene.centers_in_world[rows].mean(axis=0)[:2] - side_m / 2, np.full(2, side_m)
+    region = GroundRegion(
+        cells=((0, 0),),
+        origin_m=(float(corner[0]), float(corner[1])),
+        cell_size_m=(float(size[0]), float(size[1])),
+        z_range_m=(float(low[2]), float(high[2])),
+        padding_m=2.0,
+    )
+    folder = arguments.work / f"job{side_m:g}"
+    model = pycolmap.Reconstruction(str(arguments.model))
+    cameras = [model.cameras[camera_id] for camera_id in sorted(model.cameras)]
+    write_dense_job(folder, scene=scene, image_rows=rows, region=region, cameras=cameras, digests={})
+    return prepare_workspace(
+        folder,
+        arguments.work / "workspace",
+        image_root=arguments.truth / "images",
+        mask_root=None,
+        max_image_size_px=arguments.max_image_size,
+    )
+
+
+def _compile(job: MvsJob, options: PatchMatchOptions) -> None:
+    pair = dataclasses.replace(job, views=job.views[:2], sources=((1,), (0,)), point_views=job.point_views[:2])
+    quick = dataclasses.replace(options, iterations=(1, 1), num_random=1)
+    estimate_maps(job=pair, options=quick, seed=0, num_threads=1)
+
+
+def _cpu_seconds() -> float:
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_utime + usage.ru_stime
+
+
+if __name__ == "__main__":
+    main()
