@@ -14,6 +14,8 @@ from fusion.cloud import PointCloud
 from fusion.compare import CompareOptions, cloud_distances, compare_clouds, format_table
 from fusion.errors import CloudFormatError, FusionError
 
+pytestmark = pytest.mark.usefixtures("open3d")
+
 ALL_POINTS = CompareOptions(voxel_m=0.0, thresholds_m=(0.02, 0.05, 0.10))
 
 

@@ -15,6 +15,8 @@ from fusion.compare import mesh_distances
 from sample_data.render_street import ORIGIN_LAT_LON_ALT, StreetOptions, StreetTruth, build_street, render_street
 from sample_data.street_path import PathKind, plan_roads
 
+pytestmark = pytest.mark.usefixtures("open3d")
+
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "street"
 SMALL = StreetOptions(seed=3, n_frames=3, width=96, height=60, truth_voxel_m=0.3)
 
