@@ -3,10 +3,10 @@
     python -m benchmarks.patchmatch_quality TRUTH MODEL WORK --frames 4-8 --set prior_iterations=0
 
 TRUTH is a folder as `sample_data.render_street` writes it (`images`, `gt.ply`, `gt_mesh.ply`), MODEL a COLMAP model of
-it in the same world, WORK a folder to work in. Each `--set` is one run with `PatchMatchOptions` of the preset but for the
-fields named (`a=1;b=2`); the preset itself runs first. `region=...` is special: side of the square in metres around the
-cameras that is reconstructed. Time is CPU-seconds, user and system, of the depth maps alone, with the kernels compiled
-before.
+it in the same world, WORK a folder to work in. Each `--set` is one run with the preset's `PatchMatchOptions` but for
+the fields named (`a=1;b=2`); the preset itself runs first. `region=20` is special: side of the square in metres around
+the cameras that is reconstructed. Time is CPU-seconds, user and system, of the depth maps alone, with the kernels
+compiled before.
 """
 
 from __future__ import annotations
@@ -50,9 +50,8 @@ def main() -> None:
     logging.basicConfig(level=logging.WARNING)
     print(describe_machine(), end="\n\n")
     first, last = (int(part) for part in arguments.frames.split("-"))
-    print(
-        "| setting | CPU-s/MP | points | accuracy/completeness/F at 2 cm | 5 cm | 10 cm | 20 cm |\n|---|---|---|---|---|---|---|"
-    )
+    print("| setting | CPU-s/MP | points | accuracy/completeness/F at 2 cm | 5 cm | 10 cm | 20 cm |")
+    print("|---|---|---|---|---|---|---|")
     for number, setting in enumerate(["", *arguments.settings]):
         changes = {key: ast.literal_eval(value) for key, value in _pairs(setting)}
         side_m = float(changes.pop("region", 0.0))

@@ -21,6 +21,7 @@ from mvs_backends.colmap_maps import write_map
 from mvs_backends.patchmatch.cost.kernels import PADDING, Reference
 from mvs_backends.patchmatch.geometry import LevelCamera, depth_and_normal, level_camera
 from mvs_backends.patchmatch.images import ImageCache
+from mvs_backends.patchmatch.kernels import sweep_rows
 from mvs_backends.patchmatch.options import PatchMatchOptions, options_of_preset
 from mvs_backends.patchmatch.prior import interpolated_planes
 from mvs_backends.patchmatch.search import (
@@ -69,6 +70,7 @@ def estimate_maps(
     """
     if all(job.depth_map_path(v).exists() and job.normal_map_path(v).exists() for v in range(len(job.views))):
         return
+    _announce_compilation()
     num_levels = len(options.iterations)
     total = num_levels * len(job.views)
     folder = _kept_folder(job, options, seed)
@@ -99,6 +101,12 @@ def estimate_maps(
                 if progress is not None:
                     progress((number * len(job.views) + view + 1) * len(job.views) // total, len(job.views))
     shutil.rmtree(folder)
+
+
+def _announce_compilation() -> None:
+    compiled = Path(sweep_rows.stats.cache_path)
+    if not any(compiled.glob("kernels.sweep_rows-*.nbi")):
+        logger.info("compiling kernels, once (about 20 seconds); kept in %s", compiled)
 
 
 def _search_view(
