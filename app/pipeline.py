@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import tempfile
 import time
 from collections.abc import Mapping
@@ -125,8 +124,12 @@ def check_output(out: Path) -> None:
         raise InputError(f"{out} is a folder; name a file that ends in .ply")
     if not out.parent.is_dir():
         raise InputError(f"folder {out.parent} doesn't exist; create it or choose another output")
-    if not os.access(out.parent, os.W_OK):
-        raise InputError(f"folder {out.parent} can't be written; choose another output")
+    try:
+        # Asking for permissions isn't enough: root has them all, also where nothing can be written.
+        with tempfile.TemporaryFile(dir=out.parent):
+            pass
+    except OSError as error:
+        raise InputError(f"folder {out.parent} can't be written: {error.strerror}; choose another output") from error
 
 
 def densify_clusters(run: Run, *, allow_partial: bool, dry_run: bool = False) -> None:
