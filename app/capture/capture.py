@@ -38,7 +38,7 @@ class RigMode(StrEnum):
 class CaptureOptions:
     """Options of the capture stage."""
 
-    rig: RigMode = RigMode.AUTO
+    rig_mode: RigMode = RigMode.AUTO
     """Whether the cameras move as one rig."""
     video_interval_s: float = 0.25
     """Seconds between video frames: 2 m at 30 km/h."""
@@ -127,7 +127,7 @@ def capture(
     checked = check_images(root, names, num_threads=options.num_threads, progress=progress)
     probes = dict(zip(names, checked, strict=True))
     cameras = _cameras(source, root, probes)
-    is_rig = _is_rig([camera.name for camera in cameras], names, options.rig, rig_file)
+    is_rig = _is_rig([camera.name for camera in cameras], names, options.rig_mode, rig_file)
     frames = _with_positions(_frames(probes, is_rig, times_s), gps, poses)
     masks = _check_masks(mask_dir, probes) if mask_dir else {}
     inventory = Inventory(

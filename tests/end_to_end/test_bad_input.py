@@ -145,7 +145,7 @@ def test_models_that_cannot_be_imported(
     model = pycolmap.Reconstruction(finished_run.workspace / "sfm" / "model")
     damage(model)
     (tmp_path / "model").mkdir()
-    model.write_text(tmp_path / "model")
+    model.write_binary(tmp_path / "model")
     out = tmp_path / "town.ply"
     message = refused(cityrecon("full", finished_run.scene / "images", out, "--import", tmp_path / "model"))
     assert complaint in message

@@ -81,7 +81,7 @@ def test_folders_that_share_few_names_are_no_rig(tmp_path: Path) -> None:
     assert not inventory.is_rig
     assert len(inventory.frames) == 8
     assert inventory.frames[0].name == "cam0/cam0_1.png"
-    forced = capture(tmp_path / "images", tmp_path / "ws" / "capture", options=CaptureOptions(rig=RigMode.YES))
+    forced = capture(tmp_path / "images", tmp_path / "ws" / "capture", options=CaptureOptions(rig_mode=RigMode.YES))
     assert forced.is_rig and len(forced.frames) == 7
 
 

@@ -46,6 +46,13 @@ def test_every_option_of_a_stage_is_a_flag_of_its_command() -> None:
             assert f"--{option.replace('_', '-')}" in flags
 
 
+@pytest.mark.parametrize("command", COMMANDS)
+def test_no_flag_means_two_things(command: str) -> None:
+    parameters = typer.main.get_command(app).commands[command].params  # type: ignore[attr-defined]
+    flags = [flag for parameter in parameters for flag in (*parameter.opts, *parameter.secondary_opts)]
+    assert len(set(flags)) == len(flags)
+
+
 def test_workspace_is_beside_the_output() -> None:
     assert default_workspace(Path("a/town.ply")) == Path("a/town.workspace")
 
