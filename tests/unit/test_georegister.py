@@ -233,8 +233,8 @@ def test_the_rigs_baseline_gives_the_scale(tmp_path: Path, caplog: pytest.LogCap
     found, _ = run(tmp_path, truth, captured)
     assert found.scale_source is ScaleSource.RIG
     assert found.scale_candidates[0].metres_per_model_unit == pytest.approx(1.0 / 0.137, rel=1e-3)
-    # GPS of 4 m noise over 29 m knows the scale worse than the rig; of 0.05 m noise it knows it better.
-    for sigma_m, source in ((4.0, ScaleSource.RIG), (0.05, ScaleSource.GPS)):
+    # GPS of 4 m noise over 29 m knows the scale worse than the rig; of 0.02 m noise it knows it better.
+    for sigma_m, source in ((4.0, ScaleSource.RIG), (0.02, ScaleSource.GPS)):
         noisy_frames = replace(inventory(truth, gps_m=noisy(truth, sigma_m)), rig_file=captured.rig_file)
         found, model = run(tmp_path, truth, noisy_frames)
         assert found.scale_source is source
