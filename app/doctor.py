@@ -20,6 +20,7 @@ _PACKAGES = (
     ("opencv-python-headless", "cv2"),
     ("ortools", "ortools.linear_solver.python.model_builder"),
     ("pycolmap", "pycolmap"),
+    ("trimesh", "trimesh"),
     ("open3d", "open3d"),
 )
 

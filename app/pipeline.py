@@ -24,6 +24,7 @@ from app.stages import (
     select_stage,
     sfm_stage,
 )
+from fusion.open3d_import import import_open3d
 
 logger = logging.getLogger(__name__)
 
@@ -46,6 +47,8 @@ def full_pipeline(
     start = time.monotonic()
     check_output(out)
     check_backend(run)
+    if compare_batch:
+        import_open3d()
     logger.info("workspace: %s", run.workspace.root)
     _announce(1, "capture: taking stock of the images")
     capture_stage(run, sources)

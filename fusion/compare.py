@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from fusion.cloud import PointCloud
@@ -129,12 +130,17 @@ def mesh_distances(query: NDArray[np.float32], mesh: Path) -> NDArray[np.float32
     with mesh.open("rb"):
         pass
     o3d = import_open3d()
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        surface = o3d.t.io.read_triangle_mesh(str(mesh))
-    if "indices" not in surface.triangle or len(surface.triangle.indices) == 0:
+    try:
+        surface = trimesh.load_mesh(mesh, process=False)
+    except (ValueError, KeyError, IndexError, NotImplementedError) as error:
+        raise CloudFormatError(f"{mesh}: not a mesh that can be read; give PLY, OBJ, STL or GLB") from error
+    faces = np.asarray(getattr(surface, "faces", ()), dtype=np.uint32)
+    if len(faces) == 0:
         raise CloudFormatError(f"{mesh}: there are no triangles in this file; give a mesh")
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(surface)
+    scene.add_triangles(
+        o3d.core.Tensor.from_numpy(np.asarray(surface.vertices, dtype=np.float32)), o3d.core.Tensor.from_numpy(faces)
+    )
     distances = np.empty(len(query), dtype=np.float32)
     for start in range(0, len(query), _CHUNK_POINTS):
         chunk = np.ascontiguousarray(query[start : start + _CHUNK_POINTS])

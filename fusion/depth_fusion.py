@@ -19,7 +19,7 @@ class FusionOptions:
 
     min_num_pixels: int = 2
     """Views that must agree on a point. Two, since selection leaves little redundancy and the maps are filtered
-    already: on the sample street, three lose 13 points of completeness at 20 cm for 0.3 points of accuracy."""
+    already: on the sample street, three gain 6 points of accuracy at 5 cm, and lose 7 of completeness and 4 of F."""
     max_reproj_error_px: float = 2.0
     """Largest distance between a pixel and the reprojection of its neighbour view's point."""
     max_depth_error: float = 0.01
