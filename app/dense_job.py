@@ -17,8 +17,10 @@ import pycolmap
 from numpy.typing import NDArray
 
 from app.errors import CityReconError
+from app.options import DensifyOptions
 from app.scene.posed_scene import PosedScene
 from app.scene.submodel import write_submodel
+from app.sky import find_sky
 from app.workspace import atomic_file
 from fusion.region import GroundRegion
 from mvs_backends.base import MvsJob, MvsView
@@ -127,7 +129,7 @@ def write_dense_job(
 
 
 def prepare_workspace(
-    job_folder: Path, workspace: Path, *, image_root: Path, mask_root: Path | None, max_image_size_px: int
+    job_folder: Path, workspace: Path, *, image_root: Path, mask_root: Path | None, options: DensifyOptions
 ) -> MvsJob:
     """Make a COLMAP dense workspace of a job: undistorted images and masks, model, configuration.
 
@@ -137,22 +139,23 @@ def prepare_workspace(
         CityReconError: an image can't be read.
     """
     job = DenseJob.read(job_folder)
-    options = pycolmap.UndistortCameraOptions()
-    options.max_image_size = max_image_size_px or -1
+    undistortion = pycolmap.UndistortCameraOptions()
+    undistortion.max_image_size = options.max_image_size_px or -1
     model = pycolmap.Reconstruction(str(job_folder / "sparse"))
     for camera_id, distorted in job.cameras.items():
-        undistorted = pycolmap.undistort_camera(options, distorted.camera())
+        undistorted = pycolmap.undistort_camera(undistortion, distorted.camera())
         undistorted.camera_id = camera_id
         model.cameras[camera_id] = undistorted
-    for image in job.images:
-        camera = job.cameras[image.camera_id].camera()
-        _undistort_image(image_root / image.name, workspace / "images" / image.name, camera, options)
-        if mask_root is not None:
-            mask_name = f"{image.name}.png"
-            _undistort_mask(mask_root / mask_name, workspace / "masks" / mask_name, camera, options)
     (workspace / "sparse").mkdir(parents=True, exist_ok=True)
     model.write_binary(str(workspace / "sparse"))
-    mvs_job = _mvs_job(model, job, workspace, has_masks=mask_root is not None)
+    mvs_job = _mvs_job(model, job, workspace, has_masks=mask_root is not None or options.skip_sky)
+    row_of_name = {view.name: row for row, view in enumerate(mvs_job.views)}
+    for image in job.images:
+        camera = job.cameras[image.camera_id].camera()
+        _undistort_image(image_root / image.name, workspace / "images" / image.name, camera, undistortion)
+        unwanted = _sky(mvs_job, row_of_name[image.name]) if options.skip_sky else None
+        given = mask_root / f"{image.name}.png" if mask_root is not None else None
+        _write_mask(workspace / "masks" / f"{image.name}.png", given, unwanted, camera, undistortion)
     _write_stereo_folder(mvs_job)
     return mvs_job
 
@@ -169,16 +172,41 @@ def _undistort_image(
     _write_image(target, np.asarray(cv2.cvtColor(undistorted.to_array(), cv2.COLOR_RGB2BGR), dtype=np.uint8))
 
 
-def _undistort_mask(
-    source: Path, target: Path, camera: pycolmap.Camera, options: pycolmap.UndistortCameraOptions
+def _sky(job: MvsJob, row: int) -> NDArray[np.bool_]:
+    """(H, W) where an undistorted image shows the sky."""
+    view = job.views[row]
+    in_camera = job.points_in_world[job.point_views[row]] @ view.cam_from_world[:, :3].T + view.cam_from_world[:, 3]
+    pixels = in_camera @ view.calibration.T
+    image = cv2.imread(str(job.image_path(row)), cv2.IMREAD_COLOR)
+    if image is None:
+        raise CityReconError(f"cannot read {job.image_path(row)}; remove {job.workspace} and run the command again")
+    return find_sky(
+        np.asarray(image, dtype=np.uint8),
+        calibration=view.calibration,
+        cam_from_world=view.cam_from_world,
+        keypoints_px=pixels[:, :2] / pixels[:, 2:],
+    )
+
+
+def _write_mask(
+    target: Path,
+    given: Path | None,
+    unwanted: NDArray[np.bool_] | None,
+    camera: pycolmap.Camera,
+    options: pycolmap.UndistortCameraOptions,
 ) -> None:
-    if target.exists() or not source.exists():
+    """Write what the user's mask, undistorted, and the unwanted pixels leave over: white where depth is wanted."""
+    if target.exists():
         return
-    mask = pycolmap.Bitmap.read(str(source), as_rgb=False)
-    if mask is None:
-        raise CityReconError(f"cannot read mask {source}; restore it and run the command again")
-    undistorted, _ = pycolmap.undistort_image(options, mask, camera)
-    _write_image(target, np.asarray(np.where(undistorted.to_array() > 254, 255, 0), dtype=np.uint8))
+    masks = [] if unwanted is None else [unwanted]
+    if given is not None and given.exists():
+        mask = pycolmap.Bitmap.read(str(given), as_rgb=False)
+        if mask is None:
+            raise CityReconError(f"cannot read mask {given}; restore it and run the command again")
+        undistorted, _ = pycolmap.undistort_image(options, mask, camera)
+        masks.append(undistorted.to_array() <= 254)
+    if masks:
+        _write_image(target, np.where(np.any(masks, axis=0), 0, 255).astype(np.uint8))
 
 
 def _write_image(path: Path, pixels: NDArray[np.uint8]) -> None:

@@ -45,7 +45,7 @@ def densify_job(
             partial,
             image_root=image_root,
             mask_root=mask_root,
-            max_image_size_px=densify.max_image_size_px,
+            options=densify,
         )
         get_backend(densify.backend).estimate(job=job, options=stereo, num_threads=num_threads, progress=report)
 

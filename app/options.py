@@ -13,6 +13,8 @@ class DensifyOptions:
     """Name of the dense back-end; `cityrecon doctor` lists those that can run here."""
     max_image_size_px: int = 1600
     """Longer side of the undistorted images that stereo works on; larger images are reduced. 0: no limit."""
+    skip_sky: bool = True
+    """Find the sky in each image (smooth, bright, up to the image's upper border) and give it no depth."""
 
     def __post_init__(self) -> None:
         if self.max_image_size_px < 0:

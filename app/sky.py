@@ -1,0 +1,73 @@
+"""Where an image shows the sky, which stereo would otherwise spread over the far end of a region."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+_WORKING_SIZE_PX = 640
+_MAX_GRADIENT = 10.0
+"""Per pixel, of 255: clouds are smoother."""
+_MIN_BRIGHTNESS = 90
+_MIN_SHARE_OF_HIGHLIGHTS = 0.75
+"""The sky is about as bright as the brightest things in the image; a plain wall in the shade isn't."""
+_MAX_RED_OVER_BLUE = 10
+_MIN_AREA = 0.001
+"""Of the image."""
+_PIXELS_PER_KEYPOINT = 4000
+"""More triangulated keypoints than one per so many pixels: not the sky."""
+_BORDER_PX = 4
+
+
+def find_sky(
+    image: NDArray[np.uint8],
+    *,
+    calibration: NDArray[np.float64],
+    cam_from_world: NDArray[np.float64],
+    keypoints_px: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Smooth, bright, not reddish areas above the horizon that reach the image's upper border and hold no keypoints.
+
+    Args:
+        image: (H, W, 3) blue, green, red.
+        calibration: (3, 3) K in pixels.
+        cam_from_world: (3, 4) [R | t], world z up.
+        keypoints_px: (N, 2) pixels of the triangulated points that the image observes.
+
+    Returns:
+        (H, W) True where the sky is, and a few pixels around it, where colours mix.
+    """
+    height, width = image.shape[:2]
+    scale = min(1.0, _WORKING_SIZE_PX / max(height, width))
+    small = cv2.resize(image, (round(scale * width), round(scale * height)), interpolation=cv2.INTER_AREA)
+    grey = cv2.GaussianBlur(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY).astype(np.float32), (0, 0), 1.0)
+    gradient = np.hypot(cv2.Scharr(grey, cv2.CV_32F, 1, 0), cv2.Scharr(grey, cv2.CV_32F, 0, 1)) / 32
+    brightness = small.max(axis=2)
+    bright = max(_MIN_BRIGHTNESS, _MIN_SHARE_OF_HIGHLIGHTS * float(np.percentile(brightness, 98)))
+    reddish = small[:, :, 2].astype(np.int16) - small[:, :, 0]
+    candidate = (gradient < _MAX_GRADIENT) & (brightness >= bright) & (reddish <= _MAX_RED_OVER_BLUE)
+    candidate &= _above_horizon(small.shape[:2], scale, calibration, cam_from_world)
+    count, labels, statistics, _ = cv2.connectedComponentsWithStats(candidate.astype(np.uint8), connectivity=4)
+    row, column = (np.floor(scale * keypoints_px).astype(np.int64).T)[::-1]
+    inside = (row >= 0) & (row < labels.shape[0]) & (column >= 0) & (column < labels.shape[1])
+    keypoints = np.bincount(labels[row[inside], column[inside]], minlength=count)
+    area = statistics[:, cv2.CC_STAT_AREA]
+    is_sky = (statistics[:, cv2.CC_STAT_TOP] == 0) & (area >= _MIN_AREA * labels.size)
+    is_sky &= keypoints <= area / _PIXELS_PER_KEYPOINT
+    is_sky[0] = False
+    grown = cv2.dilate(is_sky[labels].astype(np.uint8), np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8))
+    sky: NDArray[np.bool_] = cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST).astype(np.bool_)
+    return sky
+
+
+def _above_horizon(
+    shape: tuple[int, int], scale: float, calibration: NDArray[np.float64], cam_from_world: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """(H, W) pixels of a scaled image whose rays go up."""
+    v, u = np.mgrid[0 : shape[0], 0 : shape[1]] + 0.5
+    x = (u / scale - calibration[0, 2]) / calibration[0, 0]
+    y = (v / scale - calibration[1, 2]) / calibration[1, 1]
+    right, down, forward = cam_from_world[:, 2]
+    up: NDArray[np.bool_] = right * x + down * y + forward > 0.0
+    return up

@@ -1,0 +1,89 @@
+"""The sky is found, and what only looks like it is left alone.
+
+world z up; the camera looks along world x, level, so the horizon is the middle row:
+
+    row 0    ┌──────────────┐
+             │ sky  │ wall  │   the wall: as plain and bright as the sky
+    horizon  ├──────┴───────┤
+             │     road     │
+             └──────────────┘
+"""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from app.sky import find_sky
+from tests.small_street import STREET
+
+K = np.array([[200.0, 0, 160], [0, 200, 100], [0, 0, 1]])
+CAM_FROM_WORLD = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]])
+
+
+def picture() -> NDArray[np.uint8]:
+    image = np.full((200, 320, 3), (230, 200, 180), np.uint8)
+    image[100:] = (80, 80, 80)
+    image[:, 158:162] = (20, 20, 20)
+    return image
+
+
+def sky_of(image: NDArray[np.uint8], keypoints: list[tuple[float, float]]) -> NDArray[np.bool_]:
+    return find_sky(
+        image,
+        calibration=K,
+        cam_from_world=CAM_FROM_WORLD,
+        keypoints_px=np.array(keypoints, dtype=np.float64).reshape(-1, 2),
+    )
+
+
+def test_bright_plain_area_above_the_horizon_is_sky() -> None:
+    sky = sky_of(picture(), [])
+    assert sky[:95, :150].all()
+    assert not sky[110:].any()
+
+
+def test_an_area_with_keypoints_is_a_wall() -> None:
+    wall = [(x, y) for x in np.linspace(180, 300, 5) for y in np.linspace(10, 80, 3)]
+    sky = sky_of(picture(), wall)
+    assert sky[:95, :150].all()
+    assert not sky[:, 175:].any()
+
+
+def test_what_is_below_the_horizon_or_away_from_the_border_or_reddish_is_not_sky() -> None:
+    upside_down = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0]])
+    assert not find_sky(picture(), calibration=K, cam_from_world=upside_down, keypoints_px=np.empty((0, 2)))[:90].any()
+    framed = picture()
+    framed[:20] = (20, 20, 20)
+    assert not sky_of(framed, []).any()
+    assert not sky_of(np.ascontiguousarray(picture()[:, :, ::-1]), []).any()
+
+
+@pytest.mark.parametrize("name", ["cam0/000003.jpg", "cam1/000012.jpg", "cam2/000017.jpg", "cam0/000019.jpg"])
+def test_sky_of_the_sample_is_where_rays_miss_the_town(open3d, name: str) -> None:  # type: ignore[no-untyped-def]
+    pose = next(
+        entry for entry in json.loads((STREET / "poses_gt.json").read_text(encoding="utf-8")) if entry["image"] == name
+    )
+    params = json.loads((STREET / "truth.json").read_text(encoding="utf-8"))["camera"]["params"]
+    calibration = np.array([[params[0], 0, params[2]], [0, params[1], params[3]], [0, 0, 1]])
+    rotation = np.array(pose["R"])
+    scene = open3d.t.geometry.RaycastingScene()
+    scene.add_triangles(open3d.t.io.read_triangle_mesh(str(STREET / "gt_mesh.ply")))
+    v, u = np.mgrid[0:400, 0:640] + 0.5
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(calibration).T @ rotation
+    origins = np.broadcast_to(np.array(pose["C"]), rays.shape)
+    cast = scene.cast_rays(open3d.core.Tensor.from_numpy(np.concatenate([origins, rays], -1).astype(np.float32)))
+    truth = ~np.isfinite(cast["t_hit"].numpy())
+    image = np.asarray(cv2.imread(str(STREET / "images" / name)), dtype=np.uint8)
+    found = find_sky(
+        image,
+        calibration=calibration,
+        cam_from_world=np.column_stack([rotation, pose["t"]]),
+        keypoints_px=np.empty((0, 2)),
+    )
+    border = cv2.dilate(truth.astype(np.uint8), np.ones((13, 13), np.uint8)).astype(bool)
+    assert not (found & ~border).any(), "nothing of the town is taken for sky"
+    assert truth.sum() < 500 or (found & truth).sum() > 0.9 * truth.sum()
