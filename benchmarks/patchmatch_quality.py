@@ -23,6 +23,7 @@ import numpy as np
 import pycolmap
 
 from app.dense_job import prepare_workspace, write_dense_job
+from app.options import DensifyOptions
 from app.scene.read_model import read_posed_scene
 from benchmarks.machine import describe_machine
 from fusion.cloud import read_ply
@@ -106,7 +107,7 @@ def _job(arguments: argparse.Namespace, frames: range, side_m: float) -> MvsJob:
         arguments.work / "workspace",
         image_root=arguments.truth / "images",
         mask_root=None,
-        max_image_size_px=arguments.max_image_size,
+        options=DensifyOptions(max_image_size_px=arguments.max_image_size),
     )
 
 

@@ -39,7 +39,7 @@ class PatchMatchOptions:
     """Pixels of at most this cost support the planar prior. ACMP: 0.1."""
     prior_cell_px: int = 5
     """One support pixel per cell of this size. ACMP: 5."""
-    smoothing_radius_px: int = 3
+    smoothing_radius_px: int = 2
     """At the end, each plane is averaged with those that agree within so many pixels. 0: no."""
     min_speckle_px: int = 40
     """Smaller connected pieces of a depth map are removed."""

@@ -129,7 +129,7 @@ def smoothed(plane: Array, rate: Array, radius: int) -> Array:
                     if w <= 0:
                         continue
                     here = np.array([w + a * (x - nx) + b * (y - ny), a, b])
-                    weight = (1 + 4 * ((here[0] - plane[y, x, 0]) * rate[y, x]) ** 2) ** -2
+                    weight = (1 + 16 * ((here[0] - plane[y, x, 0]) * rate[y, x]) ** 2) ** -2
                     total, mean = total + weight, mean + weight * here
             result[y, x] = mean / total
     return result

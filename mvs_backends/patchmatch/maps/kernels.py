@@ -62,8 +62,8 @@ def upsample(coarse, coarse_cost, coarse_view, coarse_grey, scale_x, scale_y, st
 def smooth_rows(first_row, last_row, radius, plane, reference, sources, out):
     """Average each pixel's plane with those of its neighbourhood that agree with it, in a band of rows.
 
-    A neighbour's plane is moved to the pixel; its weight falls off with the shift in the source views (sigma half a
-    pixel) between the two. Depth steps stay, the noise of single pixels goes, normals get consistent.
+    A neighbour's plane is moved to the pixel; its weight falls off with the shift in the source views between the two,
+    to a quarter at a quarter of a pixel. Depth steps stay, the noise of single pixels goes, normals get consistent.
     """
     height, width = plane.shape[:2]
     for y in range(first_row, last_row):
@@ -83,7 +83,7 @@ def smooth_rows(first_row, last_row, radius, plane, reference, sources, out):
                     a, b = plane[ny, nx, 1], plane[ny, nx, 2]
                     there = plane[ny, nx, 0] + a * np.float32(x - nx) + b * np.float32(y - ny)
                     shift = (there - w) * rate
-                    weight = _ONE / (_ONE + np.float32(4) * shift * shift)
+                    weight = _ONE / (_ONE + np.float32(16) * shift * shift)
                     weight *= weight
                     total += weight
                     sum_w += weight * there
