@@ -1,4 +1,4 @@
-"""Rigid alignment of a reconstruction to its truth, by camera positions."""
+"""Alignment of a reconstruction to its truth, by camera positions."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from fusion.cloud import PointCloud
 
 Motion = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Rotation (3, 3) and translation (3,)."""
+"""Rotation, maybe times a scale, (3, 3) and translation (3,)."""
 
 
 def fit_rigid(source: NDArray[np.float64], target: NDArray[np.float64]) -> Motion:
@@ -17,6 +17,14 @@ def fit_rigid(source: NDArray[np.float64], target: NDArray[np.float64]) -> Motio
     u, _, vt = np.linalg.svd((target - center_target).T @ (source - center_source))
     rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
     return rotation, center_target - rotation @ center_source
+
+
+def fit_similarity(source: NDArray[np.float64], target: NDArray[np.float64]) -> Motion:
+    """The same with a scale, which is part of the returned matrix (Umeyama 1991)."""
+    rotation, _ = fit_rigid(source, target)
+    centered = (source - source.mean(axis=0)) @ rotation.T
+    scale = float((centered * (target - target.mean(axis=0))).sum() / (centered**2).sum())
+    return scale * rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
 
 
 def position_errors(source: NDArray[np.float64], target: NDArray[np.float64], motion: Motion) -> NDArray[np.float64]:

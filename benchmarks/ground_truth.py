@@ -3,8 +3,9 @@
     python -m benchmarks.ground_truth WORKSPACE TRUTH CLOUD.ply [CLOUD.ply ...]
 
 TRUTH is a folder with `poses_gt.json`, `gt.ply`, `gt_mesh.ply` and, for errors in the world's own frame, `truth.json`,
-as `sample_data.render_street` writes them. Clouds are scored twice: as they are (georegistered, so the noise of the GPS
-counts), and after the rigid motion (no scale) that fits the cameras best, which leaves the reconstruction's own errors.
+as `sample_data.render_street` writes them. Clouds are scored as they are (georegistered, so the noise of the GPS
+counts), after the rigid motion that fits the cameras best, and after the similarity that does, which leaves the
+errors of stereo.
 Both sides are thinned to 5 cm voxels; accuracy is measured to the mesh, completeness to the samples of `gt.ply`.
 """
 
@@ -19,7 +20,7 @@ import pycolmap
 
 from app.georegister.georeference import Georeference
 from app.scene.read_model import read_posed_scene
-from benchmarks.alignment import Motion, fit_rigid, moved, position_errors
+from benchmarks.alignment import Motion, fit_rigid, fit_similarity, moved, position_errors
 from benchmarks.machine import describe_machine
 from fusion.cloud import read_ply
 from fusion.compare import CompareOptions, compare_clouds
@@ -44,7 +45,8 @@ def main() -> None:
     fitted = fit_rigid(scene.centers_in_world, expected)
     print(f"registered images      {len(scene.image_names)} of {len(truth)}")
     figures: dict[str, object] = {"registered": len(scene.image_names), "images": len(truth)}
-    frames = {"rigid fit": fitted} if shift is None else {"as georegistered": shift, "rigid fit": fitted}
+    frames = {} if shift is None else {"as georegistered": shift}
+    frames |= {"rigid fit": fitted, "similarity fit": fit_similarity(scene.centers_in_world, expected)}
     for frame, motion in frames.items():
         errors = 100 * position_errors(scene.centers_in_world, expected, motion)
         print(

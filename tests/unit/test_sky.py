@@ -10,7 +10,6 @@ world z up; the camera looks along world x, level, so the horizon is the middle 
 """
 
 import json
-from pathlib import Path
 
 import cv2
 import numpy as np
