@@ -35,7 +35,7 @@ _TINY = np.float32(1e-12)
 _NUM_AREAS = 8
 _MIN_FACING = np.float32(0.1)
 # Of a plane that no texture confirms: worse than any that the prior may be made from, good enough to be kept.
-_PRIOR_COST = np.float32(0.5)
+_PRIOR_COST = np.float32(0.4)
 _GOOD_COST = np.float32(0.8)
 _GOOD_COST_DECAY = np.float32(90)
 _BAD_COST = np.float32(1.2)

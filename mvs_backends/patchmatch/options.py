@@ -33,7 +33,7 @@ class PatchMatchOptions:
     """Bilateral weight: spread over grey values of 0 to 255. ACMM: 3 for COLMAP-like weights."""
     min_angle_deg: float = 1.5
     """Source views with a smaller triangulation angle lose weight quadratically. 0: no."""
-    max_cost: float = 0.7
+    max_cost: float = 0.5
     """Pixels of a larger final cost get no depth."""
     max_prior_cost: float = 0.15
     """Pixels of at most this cost support the planar prior. ACMP: 0.1."""
