@@ -74,7 +74,8 @@ def assign_gps(frames: Sequence[FrameEntry], table: GpsTable) -> dict[str, tuple
     """Position per frame name.
 
     A row belongs to the image of that name, else to the frame of that name or stem, else to the frame whose number
-    is that. A frame with several rows (one per camera) gets their mean. Rows by time are interpolated.
+    is that; where cameras are no rig, to one image of each camera. A frame with several rows (one per camera) gets
+    their mean. Rows by time are interpolated.
 
     Raises:
         InputError: no row fits any frame.
@@ -85,10 +86,10 @@ def assign_gps(frames: Sequence[FrameEntry], table: GpsTable) -> dict[str, tuple
     found: dict[str, list[tuple[float, float, float]]] = defaultdict(list)
     unmatched = []
     for key, (lat, lon, height) in zip(table.keys, table.positions.tolist(), strict=True):
-        frame = index.find(key)
-        if frame is None:
+        matches = index.find_all(key)
+        if not matches:
             unmatched.append(key)
-        else:
+        for frame in matches:
             found[frame.name].append((lat, lon, height))
     if not found:
         raise InputError(

@@ -39,6 +39,8 @@ class Attempt:
     """Images per model, largest first."""
     with_rig: bool
     """The rig fits, and the largest model was adjusted with it."""
+    agrees: bool
+    """Images are where the best strategy before had them."""
 
 
 @dataclass(frozen=True, kw_only=True)

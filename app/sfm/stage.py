@@ -12,6 +12,7 @@ import pycolmap
 
 from app.capture.inventory import Inventory
 from app.errors import CityReconError, InputError
+from app.sfm.agreement import positions_agree
 from app.sfm.features import extract_features
 from app.sfm.imports import import_model
 from app.sfm.isolated import run_isolated
@@ -133,18 +134,23 @@ def _try_strategies(
 ) -> tuple[tuple[Attempt, ...], str, list[Path]]:
     """Map until enough images register.
 
+    A model that has images elsewhere than the best one before it is not used, unless it registers more than twice as
+    many: what incremental mapping had right, global mapping has been metres off with.
+
     Returns:
         What was tried, the best strategy, and the folders of its models, the one to use first.
     """
     attempts: list[Attempt] = []
-    results: list[tuple[tuple[int, int], str, list[Path]]] = []
+    best: tuple[tuple[int, int], str, list[Path]] | None = None
     for strategy in options.strategies:
-        best = max(results, key=lambda result: result[0])[2][0] if results else None
         if strategy is Strategy.GLOBAL_RIG and not rig_specs(inventory):
             continue
-        folders, with_rig = _map(strategy, inventory, database, best, tried, options, log_file, progress)
+        best_model = best[2][0] if best is not None else None
+        folders, with_rig = _map(strategy, inventory, database, best_model, tried, options, log_file, progress)
         models = [pycolmap.Reconstruction(folder) for folder in folders]
         scores = [score(model) for model in models] or [(0, 0)]
+        agrees = not models or best_model is None or positions_agree(pycolmap.Reconstruction(best_model), models[0])
+        believed = agrees or (best is not None and scores[0][0] > 2 * best[0][0])
         attempts.append(
             Attempt(
                 strategy=strategy,
@@ -152,20 +158,26 @@ def _try_strategies(
                 observations=scores[0][1],
                 components=tuple(registered for registered, _ in scores),
                 with_rig=with_rig,
+                agrees=agrees,
             )
         )
-        logger.info("sfm: %s registers %d of %d images", strategy, scores[0][0], len(inventory.images))
-        if folders:
-            results.append((scores[0], strategy, folders))
-        if scores[0][0] >= options.min_registered_ratio * len(inventory.images):
+        logger.info(
+            "sfm: %s registers %d of %d images%s",
+            strategy,
+            scores[0][0],
+            len(inventory.images),
+            "" if agrees else f", but elsewhere than before: {'' if believed else 'not '}used",
+        )
+        if folders and believed and (best is None or scores[0] > best[0]):
+            best = scores[0], strategy, folders
+        if best is not None and best[0][0] >= options.min_registered_ratio * len(inventory.images):
             break
-    if not results:
+    if best is None:
         raise CityReconError(
             f"no strategy ({', '.join(options.strategies)}) finds poses for the images in {inventory.image_root}; "
             "they need more overlap, or known poses (--poses)"
         )
-    _, used, folders = max(results, key=lambda result: result[0])
-    return tuple(attempts), used, folders
+    return tuple(attempts), best[1], best[2]
 
 
 def _map(

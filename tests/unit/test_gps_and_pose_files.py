@@ -69,12 +69,19 @@ def test_gps_by_time_is_for_videos_only(tmp_path: Path) -> None:
     assert found["2"] == pytest.approx((2.0, -179.5, 4.0))
 
 
-def test_numbers_that_mean_several_frames_fit_none(tmp_path: Path) -> None:
-    frames = [FrameEntry(name=f"{c}/1.jpg", images={c: f"{c}/1.jpg"}) for c in "ab"]
+def test_a_number_means_one_image_of_each_camera_that_is_no_rig(tmp_path: Path) -> None:
+    frames = [FrameEntry(name=f"{c}/{n}.jpg", images={c: f"{c}/{n}.jpg"}) for c in "ab" for n in ("01", "02")]
+    expected = {f"{c}/02.jpg": (1.0, 2.0, 3.0) for c in "ab"}
+    for key in ("02", "2", "02.jpg"):
+        assert assign_gps(frames, read_gps_file(table(tmp_path, f"frame,lat,lon,alt\n{key},1,2,3\n"))) == expected
+
+
+def test_numbers_that_mean_several_images_of_a_camera_fit_none(tmp_path: Path) -> None:
+    frames = [FrameEntry(name=f"b/{n}.jpg", images={"b": f"b/{n}.jpg"}) for n in ("01", "left1")]
     with pytest.raises(InputError, match="fits a frame"):
         assign_gps(frames, read_gps_file(table(tmp_path, "frame,lat,lon\n1,1,2\n")))
-    assert assign_gps(frames, read_gps_file(table(tmp_path, "name,lat,lon,alt\nb/1.jpg,1,2,3\n"))) == {
-        "b/1.jpg": (1.0, 2.0, 3.0)
+    assert assign_gps(frames, read_gps_file(table(tmp_path, "name,lat,lon,alt\nb/01.jpg,1,2,3\n"))) == {
+        "b/01.jpg": (1.0, 2.0, 3.0)
     }
 
 
