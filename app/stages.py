@@ -9,7 +9,6 @@ from pathlib import Path
 
 from app.capture.inventory import Inventory
 from app.executor import available_cores, split_cores
-from app.georegister.georeference import Georeference
 from app.log import ProgressLine
 from app.run import Run
 from app.stage import digest, digest_files, finished_product, run_stage
@@ -132,17 +131,11 @@ def cluster_stage(run: Run) -> None:
     from app.clustering.stage import cluster
 
     model_product = finished_product(run.workspace.root / "georegister", "georegister")
-    georeference = Georeference.read(run.workspace.georeference_file)
     run_stage(
         run.workspace.root / "clusters",
         options=run.config.clustering,
         inputs={"model": model_product},
-        work=lambda partial: cluster(
-            run.workspace.georegistered_model,
-            partial,
-            options=run.config.clustering,
-            units_per_m=georeference.units_per_m,
-        ),
+        work=lambda partial: cluster(run.workspace.georegistered_model, partial, options=run.config.clustering),
         product=lambda folder: digest_files([folder / "clusters.jsonl"]),
     )
 

@@ -116,7 +116,7 @@ def _cluster(grid: GroundGrid, record: dict[str, Any]) -> Cluster:
     )
 
 
-def cluster_views(scene: PosedScene, options: ClusteringOptions, units_per_m: float = 1.0) -> Clustering:
+def cluster_views(scene: PosedScene, options: ClusteringOptions) -> Clustering:
     """Cut a scene into overlapping clusters of views, [O] section 3.
 
     Needs no pairwise relation between cameras; time grows with the number of blocks times the cameras near each. The
@@ -124,10 +124,8 @@ def cluster_views(scene: PosedScene, options: ClusteringOptions, units_per_m: fl
 
     Args:
         scene: A model with z up.
-        options: Lengths in metres.
-        units_per_m: Model units per metre; 1 for a metric model.
+        options: Lengths in units of the model.
     """
-    options = options.in_model_units(units_per_m)
     blocks = associate(scene, options)
     clusters = [
         Cluster(

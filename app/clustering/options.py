@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClusteringOptions:
     """How the ground is cut into blocks and which images belong to each, [O] section 3.
 
-    Lengths are metres; for a model without a known scale they are multiplied by its units per metre.
+    Lengths are metres. A model without a known scale has the median distance between consecutive frames as its unit,
+    which takes the place of a metre.
     """
 
     block_size_m: tuple[float, float] = (20.0, 20.0)
@@ -58,17 +59,3 @@ class ClusteringOptions:
             raise ValueError(f"height_margin_m must be at least 0, not {self.height_margin_m}")
         if not 0 <= self.camera_height_m < math.inf:
             raise ValueError(f"camera_height_m must be at least 0, not {self.camera_height_m}")
-
-    def in_model_units(self, units_per_m: float) -> ClusteringOptions:
-        """These options with all lengths in the model's units."""
-        if not 0 < units_per_m < math.inf:
-            raise ValueError(f"units_per_m must be positive, not {units_per_m}")
-        return replace(
-            self,
-            block_size_m=(self.block_size_m[0] * units_per_m, self.block_size_m[1] * units_per_m),
-            overlap_m=self.overlap_m * units_per_m,
-            sample_spacing_m=self.sample_spacing_m * units_per_m,
-            max_camera_distance_m=self.max_camera_distance_m * units_per_m,
-            height_margin_m=self.height_margin_m * units_per_m,
-            camera_height_m=self.camera_height_m * units_per_m,
-        )

@@ -18,27 +18,26 @@ from app.scene.read_model import read_posed_scene
 logger = logging.getLogger(__name__)
 
 
-def cluster(model_dir: Path, output_dir: Path, *, options: ClusteringOptions, units_per_m: float = 1.0) -> Clustering:
+def cluster(model_dir: Path, output_dir: Path, *, options: ClusteringOptions) -> Clustering:
     """Cut a model into clusters of views, [O] section 3.
 
     Args:
         model_dir: COLMAP model with z up.
         output_dir: Gets ``clusters.jsonl``, ``report.json`` and ``map.png``.
-        options: Lengths in metres.
-        units_per_m: Model units per metre; 1 for a metric model.
+        options: Lengths in units of the model.
 
     Raises:
         InputError: the model can't be read, or no block has enough keypoints and an image near by.
     """
     scene = read_posed_scene(model_dir)
-    clustering = cluster_views(scene, options, units_per_m)
+    clustering = cluster_views(scene, options)
     if not clustering.clusters:
         raise InputError(
             f"no block in {model_dir} has {options.min_keypoints_per_block} keypoints and an image that sees it from"
             f" {options.max_camera_distance_m:g} m away; check the model's scale and that z is up,"
             " or raise clustering.max_camera_distance_m"
         )
-    report = _report(scene, clustering, units_per_m)
+    report = _report(scene, clustering)
     _log(report)
     output_dir.mkdir(parents=True, exist_ok=True)
     write_map(scene, clustering, output_dir / "map.png")
@@ -47,7 +46,7 @@ def cluster(model_dir: Path, output_dir: Path, *, options: ClusteringOptions, un
     return clustering
 
 
-def _report(scene: PosedScene, clustering: Clustering, units_per_m: float) -> dict[str, Any]:
+def _report(scene: PosedScene, clustering: Clustering) -> dict[str, Any]:
     """The rows of [O]'s table 1 for clustering, and everything that is in no cluster or in a small one."""
     num_images, num_clusters = len(scene.image_names), len(clustering.clusters)
     num_associated = sum(len(cluster.image_names) for cluster in clustering.clusters)
@@ -59,7 +58,6 @@ def _report(scene: PosedScene, clustering: Clustering, units_per_m: float) -> di
         "num_images_after_clustering": num_associated,
         "clusters_per_image": num_associated / num_images,
         "images_per_cluster": num_associated / num_clusters,
-        "units_per_m": units_per_m,
         "num_far_keypoints": clustering.num_far_keypoints,
         "small_clusters": {c.name: len(c.image_names) for c in clustering.clusters if c.is_small},
         "images_in_no_cluster": [name for name in scene.image_names if name not in associated],

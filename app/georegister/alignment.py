@@ -127,7 +127,9 @@ def _refine(
     factor, offset, median = start
     coefficients = np.zeros(basis.shape[1], dtype=np.complex128)
     coefficients[0] = offset
-    sigma = max(median / _RAYLEIGH_MEDIAN, _MIN_SIGMA_M)
+    # Two of few positions fit exactly, which makes the median too small (Rousseeuw and Leroy 1987, 5.1.2).
+    rayleigh = _RAYLEIGH_MEDIAN / (1.0 + 5.0 / (len(source) - 2))
+    sigma = max(median / rayleigh, _MIN_SIGMA_M)
     inliers = np.ones(len(source), dtype=np.bool_)
     information, noise = 0.0, _MIN_SIGMA_M
     for iteration in range(20):
@@ -144,7 +146,7 @@ def _refine(
         noise = max(math.sqrt(float((errors[chosen] ** 2).sum()) / freedom), _MIN_SIGMA_M)
         # The median withstands gross errors; once these are out, the inliers' spread is the better measure of the
         # noise, and takes back what was good.
-        median_sigma = max(float(np.median(errors)) / _RAYLEIGH_MEDIAN, _MIN_SIGMA_M)
+        median_sigma = max(float(np.median(errors)) / rayleigh, _MIN_SIGMA_M)
         sigma = median_sigma if iteration < 10 else max(median_sigma, noise)
     residuals = factor * source + basis @ coefficients - target
     arm = abs(factor) * math.sqrt(information)

@@ -74,10 +74,7 @@ class Georeference:
     """WGS84 latitude, longitude (degrees) and height (metres, as the GPS source gives it; 0 if it gives none) of the
     world's origin; None without GPS."""
     is_metric: bool
-    """The world's unit is one metre. If not, it is `units_per_m`: one spacing of the frames."""
-    units_per_m: float
-    """World units that take the place of a metre in all options: 1 for metric models. An unscaled model is resized
-    so that the median distance between consecutive frames is one unit, so it is 1 there, too."""
+    """The world's unit is one metre. If not, it is the median distance between consecutive frames."""
     scale_source: ScaleSource
     gravity_source: GravitySource
     gravity_sigma_deg: float

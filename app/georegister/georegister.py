@@ -152,7 +152,6 @@ def georegister(
         crs=ENU_CRS if gps is not None else LOCAL_CRS,
         origin_deg_m=gps.origin_deg_m if gps is not None else None,
         is_metric=bool(candidates),
-        units_per_m=1.0,
         scale_source=candidates[0].source if candidates else ScaleSource.NONE,
         gravity_source=up.source,
         gravity_sigma_deg=up.sigma_deg,

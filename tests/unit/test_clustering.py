@@ -88,21 +88,6 @@ def test_samples_bring_in_an_image_that_sees_no_keypoint() -> None:
     assert found.image_names == ("a.jpg", "b.jpg")
 
 
-def test_an_unscaled_model_is_cut_like_the_metric_one() -> None:
-    scene = _street()
-    small = make_scene(
-        {
-            name: np.column_stack([pose[:, :3], 0.01 * pose[:, 3]])
-            for name, pose in zip(scene.image_names, scene.cam_from_world, strict=True)
-        },
-        (0.01 * scene.points_in_world).tolist(),
-    )
-    metric = cluster_views(scene, ClusteringOptions())
-    scaled = cluster_views(small, ClusteringOptions(), units_per_m=0.01)
-    assert [(c.name, c.image_names) for c in scaled.clusters] == [(c.name, c.image_names) for c in metric.clusters]
-    np.testing.assert_allclose(scaled.clusters[0].z_range_m, 0.01 * np.array(metric.clusters[0].z_range_m))
-
-
 def test_far_outliers_neither_move_nor_grow_the_grid() -> None:
     scene = _street()
     outliers = [[1e15, -1e15, 0.0], [-1e300, 1e300, 0.0], [5e6, 0.0, 0.0]]

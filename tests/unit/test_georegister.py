@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from app.capture.inventory import Inventory
 from app.errors import InputError
+from app.georegister.alignment import fit_planar
 from app.georegister.georeference import Georeference, GravitySource, ScaleSource
 from app.georegister.georegister import GeoregisterOptions, georegister
 from app.georegister.gravity import up_from_cameras
@@ -80,7 +81,7 @@ def noisy(truth: Drive, sigma_m: float, seed: int = 0) -> NDArray[np.float64]:
 def test_exact_gps_gives_the_truth(tmp_path: Path) -> None:
     truth = drive()
     found, model = run(tmp_path, truth, inventory(truth, gps_m=truth.centers_m[:, 0]))
-    assert found.is_metric and found.scale_source is ScaleSource.GPS and found.units_per_m == 1.0
+    assert found.is_metric and found.scale_source is ScaleSource.GPS
     assert found.residuals is not None and found.residuals.antenna_m is None
     assert errors_m(truth, model, found).max() < 0.03
     assert tilt_deg(truth, model) < 0.1
@@ -102,6 +103,18 @@ def test_noise_and_a_fifth_of_outliers(tmp_path: Path) -> None:
     assert tilt_deg(truth, model) < 0.7
     factor = np.cbrt(np.linalg.det(np.array(found.world_from_model).reshape(3, 4)[:, :3]))
     assert factor == pytest.approx(1.0 / 0.137, rel=0.02)
+
+
+def test_a_short_drive_keeps_its_good_positions() -> None:
+    """Two of eight positions fit a similarity exactly; that must not make the noise look smaller than it is."""
+    path = np.array([[1.4 * i, 0.04 * i * i] for i in range(8)])
+    rng = np.random.default_rng(0)
+    outliers = 0
+    for _ in range(50):
+        fit = fit_planar(path, path + rng.normal(0.0, 0.1, path.shape), seed=0)
+        assert fit is not None
+        outliers += int((~fit.inliers).sum())
+    assert outliers <= 8
 
 
 @pytest.mark.parametrize(("sigma_m", "num_frames"), [(0.3, 15), (4.5, 60)])
