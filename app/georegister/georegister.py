@@ -49,6 +49,7 @@ _MIN_GPS_FRAMES = 3
 _MIN_HEIGHTS = 5
 _CONFLICT_SIGMAS = 4.0
 _MIN_SHARE = 0.1
+_MIN_FITTING = 0.7
 _MAX_OUTLIER_NAMES = 100
 
 
@@ -426,6 +427,13 @@ def _log(georeference: Georeference) -> None:
             found.horizontal_rms_m,
             "unknown" if found.vertical_rms_m is None else f"{found.vertical_rms_m:.2f} m",
         )
+        if found.num_inliers < _MIN_FITTING * found.num_frames:
+            logger.warning(
+                "only %d of %d GPS positions fit the model: one of the two is wrong in places; check the poses before "
+                "trusting the cloud",
+                found.num_inliers,
+                found.num_frames,
+            )
     logger.info("up from %s, within about %.1f degrees", georeference.gravity_source, georeference.gravity_sigma_deg)
     for candidate in georeference.scale_candidates:
         logger.info(

@@ -62,7 +62,8 @@ class SfmOptions:
     max_position_distance_m: float = 20.0
     """But with none farther away than this."""
     num_similar_images: int = 3
-    """Where no positions are known, each image is matched with this many that look most alike."""
+    """Where no positions are known, or several cameras are no rig, each image is matched with this many that look most
+    alike."""
     max_exhaustive_images: int = 30
     """Sets of up to this many images are matched exhaustively."""
     min_registered_ratio: float = 0.9

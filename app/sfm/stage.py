@@ -103,8 +103,10 @@ def run_sfm(
 
 
 def _pairs(inventory: Inventory, database: Path, options: SfmOptions) -> list[Pair]:
-    located = np.isfinite(frame_positions_m(inventory.frames)).all(axis=1)
-    if len(inventory.images) <= options.max_exhaustive_images or located.mean() > _MIN_LOCATED_RATIO:
+    located = np.isfinite(frame_positions_m(inventory.frames)).all(axis=1).mean() > _MIN_LOCATED_RATIO
+    # Positions don't say which way a camera looks: that is known within a rig's frames, or when there is one camera.
+    is_aligned = inventory.is_rig or len(inventory.cameras) == 1
+    if len(inventory.images) <= options.max_exhaustive_images or (located and is_aligned):
         return image_pairs(inventory, options)
     return image_pairs(inventory, options, similar_pairs(database, inventory.frames, options))
 

@@ -105,6 +105,17 @@ def test_noise_and_a_fifth_of_outliers(tmp_path: Path) -> None:
     assert factor == pytest.approx(1.0 / 0.137, rel=0.02)
 
 
+@pytest.mark.parametrize(("num_wrong", "warned"), [(4, False), (16, True)])
+def test_says_when_gps_and_model_disagree(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, num_wrong: int, warned: bool
+) -> None:
+    truth = drive(40)
+    gps = noisy(truth, 0.3)
+    gps[:num_wrong] += np.random.default_rng(2).normal(0.0, 20.0, (num_wrong, 3))
+    run(tmp_path, truth, inventory(truth, gps_m=gps))
+    assert ("GPS positions fit the model" in caplog.text) == warned
+
+
 def test_a_short_drive_keeps_its_good_positions() -> None:
     """Two of eight positions fit a similarity exactly; that must not make the noise look smaller than it is."""
     path = np.array([[1.4 * i, 0.04 * i * i] for i in range(8)])
