@@ -149,9 +149,10 @@ def select(run: Run) -> None:
 @stage_command(app, "densify", "stereo")
 def densify(run: Run, allow_partial: PartialOption = False, dry_run: DryRunOption = False) -> None:
     """Estimate depth and normal maps of each cluster."""
+    from app.dense_stages import cluster_jobs
     from app.pipeline import densify_clusters
 
-    densify_clusters(run, allow_partial=allow_partial, dry_run=dry_run)
+    densify_clusters(run, cluster_jobs(run), allow_partial=allow_partial, dry_run=dry_run)
 
 
 @stage_command(app, "fusion")
@@ -164,9 +165,10 @@ def fuse(
     allow_partial: PartialOption = False,
 ) -> None:
     """Fuse depth maps, crop each cluster to its cells, and merge all into one cloud."""
+    from app.dense_stages import cluster_jobs
     from app.pipeline import fuse_clusters
 
-    fuse_clusters(run, out=out or run.workspace.cloud_file, allow_partial=allow_partial)
+    fuse_clusters(run, cluster_jobs(run), out=out or run.workspace.cloud_file, allow_partial=allow_partial)
 
 
 @stage_command(app, "densify", "stereo", "fusion")

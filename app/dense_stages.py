@@ -72,7 +72,7 @@ def _write_jobs(
 
 
 def cluster_jobs(run: Run) -> dict[str, Path]:
-    """Write one job folder per cluster: its selected views, its cells."""
+    """Write one job folder per cluster that has views: its selected views, its cells."""
 
     def jobs() -> dict[str, tuple[tuple[str, ...], GroundRegion]]:
         clusters = Clustering.read(run.workspace.root / "clusters")
@@ -80,6 +80,7 @@ def cluster_jobs(run: Run) -> dict[str, Path]:
         return {
             selection.cluster: (selection.image_names, regions[selection.cluster])
             for selection in read_selections(run.workspace.root / "selection")
+            if selection.image_names
         }
 
     return _write_jobs(run, run.workspace.root / "jobs", jobs)

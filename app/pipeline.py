@@ -61,9 +61,10 @@ def full_pipeline(
     _announce(5, "select: choosing views")
     select_stage(run)
     _announce(6, "densify: estimating depth and normal maps")
-    densify_clusters(run, allow_partial=allow_partial)
+    jobs = cluster_jobs(run)
+    densify_clusters(run, jobs, allow_partial=allow_partial)
     _announce(7, "fuse: depth maps to one cloud")
-    fuse_clusters(run, out=out, allow_partial=allow_partial)
+    fuse_clusters(run, jobs, out=out, allow_partial=allow_partial)
     if compare_batch:
         _announce(8, "batch: reconstructing the whole set at once, to compare")
         batch = run.workspace.batch_cloud_file
@@ -135,9 +136,8 @@ def check_output(out: Path) -> None:
         raise InputError(f"folder {out.parent} can't be written: {error.strerror}; choose another output") from error
 
 
-def densify_clusters(run: Run, *, allow_partial: bool, dry_run: bool = False) -> None:
+def densify_clusters(run: Run, jobs: Mapping[str, Path], *, allow_partial: bool, dry_run: bool = False) -> None:
     """Depth and normal maps of every cluster, or how much work that is."""
-    jobs = cluster_jobs(run)
     if dry_run:
         _log_work(run, jobs, run.workspace.root / "dense")
         return
@@ -145,9 +145,8 @@ def densify_clusters(run: Run, *, allow_partial: bool, dry_run: bool = False) ->
     _check(failures, len(jobs), allow_partial=allow_partial)
 
 
-def fuse_clusters(run: Run, *, out: Path, allow_partial: bool) -> None:
+def fuse_clusters(run: Run, jobs: Mapping[str, Path], *, out: Path, allow_partial: bool) -> None:
     """One cloud of all clusters."""
-    jobs = cluster_jobs(run)
     failures = fuse_stage(
         run,
         jobs=jobs,

@@ -94,7 +94,7 @@ def select(
     if gaps:
         logger.warning("%d selections are not proven the best: raise selection.max_solver_nodes", len(gaps))
     for name in empty:
-        logger.warning("cluster %s has no two views that match", name)
+        logger.warning("cluster %s has no two views that match: it stays empty", name)
 
 
 def _solved(problems: Iterable[ViewProblem], options: SelectionOptions, num_workers: int) -> Iterator[Selection]:

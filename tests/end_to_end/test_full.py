@@ -185,3 +185,16 @@ def test_moved_images_are_the_same_images(finished_run: FinishedRun, tmp_path: P
     assert redone[0].startswith("capture: redoing, because of")
     assert "changed images" in redone[0]
     assert (tmp_path / "again.ply").read_bytes() == finished_run.out.read_bytes()
+
+
+def test_a_cluster_without_views_is_left_out(finished_run: FinishedRun, tmp_path: Path) -> None:
+    workspace = finished_run.copy_to(tmp_path)
+    shutil.rmtree(workspace / "jobs")
+    selection = workspace / "selection" / "selection.jsonl"
+    first, *others = (json.loads(line) for line in selection.read_text(encoding="utf-8").splitlines())
+    lines = [json.dumps(record) for record in (first | {"image_names": []}, *others)]
+    selection.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    result = cityrecon("fuse", workspace, "--out", tmp_path / "out.ply")
+    assert result.returncode == 0, result.stderr
+    assert f"from {len(others)} of {len(others)} clusters" in result.stderr
+    assert 0 < (tmp_path / "out.ply").stat().st_size < finished_run.out.stat().st_size
