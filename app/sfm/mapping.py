@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from app.sfm.rigs import (
     scale_to_rigs,
     write_rigs,
 )
+from app.sfm.steadiness import num_steady_images, steady_cameras
 
 logger = logging.getLogger(__name__)
 
@@ -60,10 +62,17 @@ def map_images(
         write_rigs(handle, specs if strategy is Strategy.GLOBAL_RIG else (), inventory)
         fixed = fixed_cameras(handle, inventory, options)
         num_cameras = handle.num_cameras()
+    pipeline = incremental_options(options, fixed)
+    if strategy is Strategy.INCREMENTAL_FIXED:
+        pipeline.ba_refine_extra_params = False
+        pipeline.mapper.abs_pose_refine_extra_params = False
     if strategy in (Strategy.INCREMENTAL, Strategy.INCREMENTAL_FIXED):
-        models = _incremental(database, inventory, output, options, fixed, strategy, progress)
+        models = map_incrementally(database, inventory, output, pipeline, progress)
     else:
         models = _global(database, inventory, output, options, len(fixed) == num_cameras)
+    if models and strategy is not Strategy.GLOBAL_RIG:
+        largest = max(models, key=score)
+        models = [mend(model, database, inventory, output, pipeline) if model is largest else model for model in models]
     remove_database(database)
     write_models(models, output)
 
@@ -96,19 +105,49 @@ def fixed_cameras(database: pycolmap.Database, inventory: Inventory, options: Sf
     return {camera_ids[name] for name in known if name in camera_ids}
 
 
-def _incremental(
+def mend(
+    model: pycolmap.Reconstruction,
     database: Path,
     inventory: Inventory,
     output: Path,
-    options: SfmOptions,
-    fixed: set[int],
-    strategy: Strategy,
+    pipeline: pycolmap.IncrementalPipelineOptions,
+) -> pycolmap.Reconstruction:
+    """A model torn between its cameras, mapped on from those that hold together, if that helps; else as it was.
+
+    Args:
+        model: of single images.
+        database: that it was mapped from.
+        inventory: which images belong to a frame.
+        output: for scratch.
+        pipeline: changed to map one model.
+    """
+    steady = steady_cameras(model, inventory)
+    camera_of_image = {image: camera for frame in inventory.frames for camera, image in frame.images.items()}
+    torn = [i for i in model.reg_image_ids() if camera_of_image[model.image(i).name] not in steady]
+    if not torn:
+        return model
+    logger.info("sfm: %d images moved relative to the others of their frames: registering them anew", len(torn))
+    start = output / "steady"
+    start.mkdir()
+    rest = pycolmap.Reconstruction(model)
+    for image_id in torn:
+        rest.deregister_frame(rest.image(image_id).frame_id)
+    rest.write_binary(start)
+    pipeline.multiple_models = False
+    mended = pycolmap.incremental_mapping(database, inventory.image_root, start, pipeline, input_path=start)
+    shutil.rmtree(start)
+    candidates = [model, *mended.values()]
+    return max(candidates, key=lambda candidate: (num_steady_images(candidate, inventory), *score(candidate)))
+
+
+def map_incrementally(
+    database: Path,
+    inventory: Inventory,
+    output: Path,
+    pipeline: pycolmap.IncrementalPipelineOptions,
     progress: Progress,
 ) -> list[pycolmap.Reconstruction]:
-    pipeline = incremental_options(options, fixed)
-    if strategy is Strategy.INCREMENTAL_FIXED:
-        pipeline.ba_refine_extra_params = False
-        pipeline.mapper.abs_pose_refine_extra_params = False
+    """COLMAP's incremental mapping; ``output`` gets its models, ``progress`` images registered and in all."""
     registered, total = 0, len(inventory.images)
 
     def count() -> None:

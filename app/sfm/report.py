@@ -34,6 +34,8 @@ class Attempt:
 
     strategy: str
     registered: int
+    steady: int
+    """Registered images of cameras that keep their places relative to each other."""
     observations: int
     components: tuple[int, ...]
     """Images per model, largest first."""
@@ -41,6 +43,22 @@ class Attempt:
     """The rig fits, and the largest model was adjusted with it."""
     agrees: bool
     """Images are where the best strategy before had them."""
+
+    @property
+    def is_torn(self) -> bool:
+        """Cameras of a rig don't keep their places relative to each other."""
+        return self.steady < self.registered
+
+    @property
+    def rank(self) -> tuple[int, int, int]:
+        """What makes one attempt better than another."""
+        return self.steady, self.registered, self.observations
+
+    def describe(self, num_images: int) -> str:
+        """One line."""
+        torn = f", {self.registered - self.steady} of them torn off" if self.is_torn else ""
+        elsewhere = "" if self.agrees else ", elsewhere than before"
+        return f"{self.strategy} registers {self.registered} of {num_images} images{torn}{elsewhere}"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,6 +24,7 @@ from app.sfm.pairs import Pair, frame_positions_m, image_pairs
 from app.sfm.report import Attempt, SfmReport, make_report
 from app.sfm.retrieval import similar_pairs
 from app.sfm.rigs import rig_specs
+from app.sfm.steadiness import num_steady_images
 from app.workspace import remove_tree
 
 __all__ = ["import_model", "run_sfm"]
@@ -136,50 +137,55 @@ def _try_strategies(
 ) -> tuple[tuple[Attempt, ...], str, list[Path]]:
     """Map until enough images register.
 
-    A model that has images elsewhere than the best one before it is not used, unless it registers more than twice as
-    many: what incremental mapping had right, global mapping has been metres off with.
+    A model that has images elsewhere than the best one before it is not used, unless that one was torn or registered
+    less than half as many: what incremental mapping had right, global mapping has been metres off with.
 
     Returns:
         What was tried, the best strategy, and the folders of its models, the one to use first.
     """
     attempts: list[Attempt] = []
-    best: tuple[tuple[int, int], str, list[Path]] | None = None
+    best: tuple[Attempt, list[Path]] | None = None
+    enough = options.min_registered_ratio * len(inventory.images)
     for strategy in options.strategies:
         if strategy is Strategy.GLOBAL_RIG and not rig_specs(inventory):
             continue
-        best_model = best[2][0] if best is not None else None
-        folders, with_rig = _map(strategy, inventory, database, best_model, tried, options, log_file, progress)
-        models = [pycolmap.Reconstruction(folder) for folder in folders]
-        scores = [score(model) for model in models] or [(0, 0)]
-        agrees = not models or best_model is None or positions_agree(pycolmap.Reconstruction(best_model), models[0])
-        believed = agrees or (best is not None and scores[0][0] > 2 * best[0][0])
-        attempts.append(
-            Attempt(
-                strategy=strategy,
-                registered=scores[0][0],
-                observations=scores[0][1],
-                components=tuple(registered for registered, _ in scores),
-                with_rig=with_rig,
-                agrees=agrees,
-            )
+        best_folder = best[1][0] if best is not None else None
+        folders, with_rig = _map(strategy, inventory, database, best_folder, tried, options, log_file, progress)
+        models = [pycolmap.Reconstruction(folder) for folder in folders] or [pycolmap.Reconstruction()]
+        registered, observations = score(models[0])
+        attempt = Attempt(
+            strategy=strategy,
+            registered=registered,
+            steady=num_steady_images(models[0], inventory),
+            observations=observations,
+            components=tuple(model.num_reg_images() for model in models),
+            with_rig=with_rig,
+            agrees=best_folder is None or positions_agree(pycolmap.Reconstruction(best_folder), models[0]),
         )
-        logger.info(
-            "sfm: %s registers %d of %d images%s",
-            strategy,
-            scores[0][0],
-            len(inventory.images),
-            "" if agrees else f", but elsewhere than before: {'' if believed else 'not '}used",
-        )
-        if folders and believed and (best is None or scores[0] > best[0]):
-            best = scores[0], strategy, folders
-        if best is not None and best[0][0] >= options.min_registered_ratio * len(inventory.images):
+        attempts.append(attempt)
+        logger.info("sfm: %s", attempt.describe(len(inventory.images)))
+        if best is None:
+            is_better = registered > 0
+        elif attempt.agrees or best[0].is_torn or registered > 2 * best[0].registered:
+            is_better = attempt.rank > best[0].rank
+        else:
+            is_better = False
+        if is_better:
+            best = attempt, folders
+        if best is not None and best[0].steady >= enough:
             break
     if best is None:
         raise CityReconError(
             f"no strategy ({', '.join(options.strategies)}) finds poses for the images in {inventory.image_root}; "
             "they need more overlap, or known poses (--poses)"
         )
-    return tuple(attempts), best[1], best[2]
+    if best[0].is_torn:
+        logger.warning(
+            "the cameras of %d images don't keep their places beside the others: their poses are wrong, or the cameras "
+            "are no rig (then set capture.rig_mode=no)",
+            best[0].registered - best[0].steady,
+        )
+    return tuple(attempts), best[0].strategy, best[1]
 
 
 def _map(

@@ -15,9 +15,13 @@ from numpy.typing import NDArray
 
 from app.capture.inventory import CameraEntry, FrameEntry, ImageEntry, Inventory
 from app.errors import InputError
+from app.sfm.database import copy_for_mapping
+from app.sfm.mapping import incremental_options, map_incrementally, mend
 from app.sfm.options import SfmOptions, Strategy
 from app.sfm.report import SfmReport
+from app.sfm.rigs import write_rigs
 from app.sfm.stage import run_sfm
+from app.sfm.steadiness import num_steady_images
 
 STREET = Path(__file__).resolve().parents[2] / "sample_data" / "street"
 OPTIONS = SfmOptions(num_threads=2, max_num_features=1500)
@@ -161,6 +165,29 @@ def test_one_strategy_after_the_other_until_one_works(
     assert report.components == (5, 5, 5)
     assert sorted(path.name for path in (again / "components").iterdir()) == ["0", "1", "2"]
     assert set(report.unregistered.values()) == {"in another component"}
+
+
+def test_a_torn_model_is_mended(street: Inventory, finished: tuple[Path, SfmReport], tmp_path: Path) -> None:
+    """The images of one camera at half the scale, as moving cars can make them, are registered anew."""
+    output, _ = finished
+    copy_for_mapping(output / "database.db", tmp_path / "mapping.db")
+    with pycolmap.Database.open(tmp_path / "mapping.db") as database:
+        write_rigs(database, (), street)
+    (right,) = map_incrementally(
+        tmp_path / "mapping.db", street, tmp_path, incremental_options(OPTIONS, set()), lambda done, total: None
+    )
+    torn = pycolmap.Reconstruction(right)
+    for image_id in torn.reg_image_ids():
+        image = torn.image(image_id)
+        if image.name.startswith("cam2/"):
+            pose = image.cam_from_world()
+            pose.translation = 0.5 * pose.translation
+            torn.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
+    assert num_steady_images(torn, street) == 2 * NUM_FRAMES
+    mended = mend(torn, tmp_path / "mapping.db", street, tmp_path, incremental_options(OPTIONS, set()))
+    assert num_steady_images(mended, street) == 3 * NUM_FRAMES
+    errors, _ = errors_and_scale(mended)
+    assert errors.max() < 0.05
 
 
 def test_names_with_spaces_and_a_corrupted_database(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from app.capture.inventory import CameraEntry, FrameEntry, ImageEntry, Inventory
 from app.sfm.rigs import RigSpec, derive_rig, middle_pose, pose_frames, rigs_and_frames, scale_to_rigs
+from app.sfm.steadiness import num_steady_images, steady_cameras
 
 SIDE_FROM_FRONT = pycolmap.Rigid3d(
     pycolmap.Rotation3d(np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])), [0.2, 0.0, -0.5]
@@ -104,3 +106,18 @@ def test_the_middle_pose_is_one_of_the_majority() -> None:
     near = [pycolmap.Rigid3d(pycolmap.Rotation3d(), [0.01 * step, 0.0, 0.0]) for step in range(5)]
     far = [pycolmap.Rigid3d(pycolmap.Rotation3d(), [100.0, 0.0, 0.0])] * 2
     assert middle_pose([*far, *near]).translation[0] <= 0.04
+
+
+def test_a_camera_torn_from_the_others_is_found() -> None:
+    """The side camera's drive, right in itself, at another scale; a moment's delay is no tear."""
+    assert steady_cameras(single_images(true_poses()), inventory()) == {"front", "side"}
+    torn, late = true_poses(), true_poses()
+    for number in range(9):
+        name = f"side/{number}.jpg"
+        torn[name][:, 3] *= 0.5
+        late[name][:, 3] += late[name][:, :3] @ [0.0, 0.0, 0.4 * np.sin(number)]
+    del torn["side/8.jpg"]
+    assert steady_cameras(single_images(torn), inventory()) == {"front"}
+    assert num_steady_images(single_images(torn), inventory()) == 9
+    assert steady_cameras(single_images(late), inventory()) == {"front", "side"}
+    assert steady_cameras(single_images(torn), replace(inventory(), is_rig=False)) == {"front", "side"}
