@@ -145,7 +145,7 @@ def check_backend(run: Run) -> None:
         CityReconError: it can't run here.
     """
     try:
-        availability = get_backend(run.config.densify.backend).availability()
+        availability = get_backend(run.config.densify.backend).availability(run.config.stereo)
     except ValueError as error:
         raise InputError(str(error)) from error
     if not availability.ok:

@@ -12,7 +12,8 @@ from pathlib import Path
 from app.executor import available_cores
 from fusion.errors import FusionError
 from fusion.open3d_import import import_open3d
-from mvs_backends import BACKEND_NAMES, get_backend
+from mvs_backends import backend_names, get_backend
+from mvs_backends.base import MvsOptions
 
 _PACKAGES = (
     ("numpy", "numpy"),
@@ -41,8 +42,8 @@ def diagnose() -> str:
             problem += " (only `compare` needs it)"
         lines.append(f"  {distribution:24}{_version(distribution):14}{problem or 'works'}")
     lines += ["", "dense back-ends"]
-    for name in BACKEND_NAMES:
-        availability = get_backend(name).availability()
+    for name in backend_names():
+        availability = get_backend(name).availability(MvsOptions())
         lines.append(f"  {name:24}{'yes' if availability.ok else 'no':14}{availability.reason}")
     return "\n".join(lines)
 

@@ -1,22 +1,48 @@
-"""Dense multi-view stereo back-ends."""
+"""Dense multi-view stereo back-ends.
+
+Other packages add theirs by an entry point of the group `cityrecon.mvs_backends` that names a subclass of `MvsBackend`.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+from importlib.metadata import EntryPoint, entry_points
+
+from mvs_backends.acm import PROGRAMS, Acm
 from mvs_backends.base import MvsBackend
 from mvs_backends.patchmatch.backend import PatchMatch
 
-_BACKENDS: dict[str, type[MvsBackend]] = {PatchMatch.name: PatchMatch}
+_BUILT_IN: dict[str, Callable[[], MvsBackend]] = {
+    "patchmatch": PatchMatch,
+    **{program.lower(): partial(Acm, program) for program in PROGRAMS},
+}
 
-BACKEND_NAMES = tuple(_BACKENDS)
-"""Valid back-end names."""
+
+def backend_names() -> tuple[str, ...]:
+    """Valid back-end names: our own, then those of other packages."""
+    return (*_BUILT_IN, *(name for name in sorted(_entry_points()) if name not in _BUILT_IN))
 
 
 def get_backend(name: str) -> MvsBackend:
     """The back-end of that name.
 
     Raises:
-        ValueError: no such back-end.
+        ValueError: no such back-end, or another package's doesn't load.
     """
-    if name not in _BACKENDS:
-        raise ValueError(f"no back-end {name!r}; choose one of: {', '.join(BACKEND_NAMES)}")
-    return _BACKENDS[name]()
+    if name in _BUILT_IN:
+        return _BUILT_IN[name]()
+    found = _entry_points().get(name)
+    if found is None:
+        raise ValueError(f"no back-end {name!r}; choose one of: {', '.join(backend_names())}")
+    try:
+        backend = found.load()()
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"back-end {name!r} of {found.value} doesn't load: {error}") from error
+    if not isinstance(backend, MvsBackend):
+        raise ValueError(f"back-end {name!r}: {found.value} is no MvsBackend")
+    return backend
+
+
+def _entry_points() -> dict[str, EntryPoint]:
+    return {entry.name: entry for entry in entry_points(group="cityrecon.mvs_backends")}

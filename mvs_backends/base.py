@@ -84,8 +84,14 @@ class MvsOptions:
     """Source views per reference view. 0: the preset's own number."""
     seed: int = 0
     """Seed of the random search; same seed, same bytes, for any number of threads."""
+    acmp_path: str = ""
+    """Executable of ACMP, ACMH, ACMM or ACMMP, or the folder that holds it. Empty: searched on PATH."""
+    program_timeout_s: float = 0.0
+    """A back-end's program is stopped if it works longer than this on one cluster. 0: never."""
 
     def __post_init__(self) -> None:
+        if not self.program_timeout_s >= 0:
+            raise ValueError(f"program_timeout_s must be at least 0, not {self.program_timeout_s}")
         if self.num_source_views < 0:
             raise ValueError(f"num_source_views must be at least 0, not {self.num_source_views}")
 
@@ -104,7 +110,7 @@ class MvsBackend(ABC):
     name: ClassVar[str]
 
     @abstractmethod
-    def availability(self) -> Availability:
+    def availability(self, options: MvsOptions) -> Availability:
         """Whether this back-end can run on this machine."""
 
     @abstractmethod

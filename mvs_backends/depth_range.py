@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mvs_backends.base import MvsView
+from mvs_backends.base import MvsJob, MvsView
 
 
 def depth_range(
@@ -44,3 +44,27 @@ def depth_range(
             leave = np.where(hit, np.maximum(leave, far), leave)
     entry[leave <= 0] = 0.0
     return entry, leave
+
+
+def view_depth_range(job: MvsJob, view: int) -> tuple[float, float] | None:
+    """Least and greatest depth at which a view can see the region.
+
+    For a camera inside the region the least is half of that of the nearest sparse point, or a hundredth of the greatest
+    without one.
+
+    Returns:
+        Camera z, or None where no ray meets the region.
+    """
+    camera = job.views[view]
+    entry, leave = depth_range(camera, job.boxes_in_world, max(camera.width // 8, 1), max(camera.height // 8, 1))
+    hit = leave > 0
+    if not hit.any():
+        return None
+    far = float(leave[hit].max())
+    near = float(entry[hit].min())
+    if near <= 0.0:
+        points = job.points_in_world[job.point_views[view]]
+        depths = points @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
+        depths = depths[depths > 0.0]
+        near = 0.5 * float(depths.min()) if len(depths) else 0.01 * far
+    return min(near, 0.5 * far), far

@@ -16,8 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mvs_backends.base import Availability, MvsBackend, MvsError, MvsJob, MvsOptions, Progress
-from mvs_backends.colmap_maps import write_map
+from mvs_backends.base import Availability, MvsBackend, MvsJob, MvsOptions, Progress
+from mvs_backends.colmap_maps import has_maps, write_maps
+from mvs_backends.masks import read_mask
 from mvs_backends.patchmatch.cost.kernels import PADDING, Reference
 from mvs_backends.patchmatch.geometry import LevelCamera, depth_and_normal, level_camera
 from mvs_backends.patchmatch.images import ImageCache
@@ -42,7 +43,7 @@ class PatchMatch(MvsBackend):
 
     name: ClassVar[str] = "patchmatch"
 
-    def availability(self) -> Availability:
+    def availability(self, options: MvsOptions) -> Availability:
         """Always: it needs nothing but this package."""
         return Availability(ok=True, reason="built in, runs on the CPU")
 
@@ -68,7 +69,7 @@ def estimate_maps(
     Raises:
         MvsError: an image or mask can't be read.
     """
-    if all(job.depth_map_path(v).exists() and job.normal_map_path(v).exists() for v in range(len(job.views))):
+    if all(has_maps(job, view) for view in range(len(job.views))):
         return
     _announce_compilation()
     num_levels = len(options.iterations)
@@ -79,11 +80,7 @@ def estimate_maps(
         for number in range(num_levels):
             for view in range(len(job.views)):
                 last = number == num_levels - 1
-                done = (
-                    job.depth_map_path(view).exists() and job.normal_map_path(view).exists()
-                    if last
-                    else _kept_file(folder, number, view).exists()
-                )
+                done = has_maps(job, view) if last else _kept_file(folder, number, view).exists()
                 if not done:
                     started = time.perf_counter()
                     found = _search_view(job, view, number, options, seed, images, folder, executor)
@@ -123,7 +120,7 @@ def _search_view(
     level = _level(options, number)
     camera = level_camera(job.views[view], level)
     grey, _ = images.get(view, level)
-    limits = inverse_range(job, view, camera, _mask(job, view, camera.width, camera.height))
+    limits = inverse_range(job, view, camera, read_mask(job, view, camera.width, camera.height))
     reference = _reference(camera, grey, limits)
     # By index: nothing depends on the order in which a job names them.
     sources = sorted(job.sources[view][: options.num_source_views])
@@ -168,7 +165,7 @@ def _full_size(job: MvsJob, view: int, found: Hypotheses, options: PatchMatchOpt
     if options.finest_level == 0:
         return found
     camera = level_camera(job.views[view], 0)
-    limits = inverse_range(job, view, camera, _mask(job, view, camera.width, camera.height))
+    limits = inverse_range(job, view, camera, read_mask(job, view, camera.width, camera.height))
     reference = _reference(camera, images.get(view, 0)[0], limits)
     return upsampled(found, images.get(view, options.finest_level)[0], reference)
 
@@ -187,34 +184,13 @@ def _level(options: PatchMatchOptions, number: int) -> int:
     return options.finest_level + len(options.iterations) - 1 - number
 
 
-def _mask(job: MvsJob, view: int, width: int, height: int) -> NDArray[np.bool_] | None:
-    """True where depth is wanted; None without masks or for a view without one."""
-    if job.mask_dir is None:
-        return None
-    path = job.mask_dir / f"{job.views[view].name}.png"
-    if not path.exists():
-        return None
-    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if mask is None:
-        raise MvsError(f"cannot read mask {path}; remove or replace it")
-    # Nothing wanted is lost and nothing masked is kept at a coarse level: the last level decides.
-    return np.asarray(cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST)) > 0
-
-
 def _write_maps(job: MvsJob, view: int, found: Hypotheses, options: PatchMatchOptions) -> None:
     """Filter the last pass' hypotheses and leave them as COLMAP's maps."""
     plane = found.plane.copy()
     plane[~(found.cost <= options.max_cost)] = 0.0
     plane[_speckles(plane[..., 0], options.min_speckle_px)] = 0.0
     depth, normal = depth_and_normal(plane, level_camera(job.views[view], 0).calibration)
-    depth_path, normal_path = job.depth_map_path(view), job.normal_map_path(view)
-    depth_partial, normal_partial = (p.with_name(f".{p.name}.partial") for p in (depth_path, normal_path))
-    for path in (depth_path, normal_path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    write_map(depth_partial, depth)
-    write_map(normal_partial, normal)
-    normal_partial.replace(normal_path)
-    depth_partial.replace(depth_path)
+    write_maps(job, view, depth, normal)
 
 
 def _speckles(inverse_depth: NDArray[np.float32], min_speckle_px: int) -> NDArray[np.bool_]:

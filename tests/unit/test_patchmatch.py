@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fusion.cloud import read_ply
-from mvs_backends import BACKEND_NAMES, get_backend
+from mvs_backends import backend_names, get_backend
 from mvs_backends.base import MvsError, MvsJob, MvsOptions, Preset
 from mvs_backends.patchmatch.backend import estimate_maps
 from mvs_backends.patchmatch.options import PatchMatchOptions
@@ -191,9 +191,9 @@ def test_unreadable_image_is_named(tmp_path: Path) -> None:
 
 
 def test_unknown_backend_lists_the_valid_ones() -> None:
-    with pytest.raises(ValueError, match=", ".join(BACKEND_NAMES)):
+    with pytest.raises(ValueError, match=", ".join(backend_names())):
         get_backend("nonsense")
-    assert get_backend("patchmatch").availability().ok
+    assert get_backend("patchmatch").availability(MvsOptions()).ok
 
 
 @pytest.mark.parametrize("preset", list(Preset))

@@ -1,0 +1,169 @@
+"""ACMP and its kin (Xu & Tao 2019, 2020; Xu et al. 2022) as subprocesses on a CUDA GPU: `acmh acmm acmp acmmp`.
+
+All read a folder with `images/%08d.jpg`, `cams/%08d_cam.txt` and `pair.txt`, and leave `depths_geom.dmb` and
+`normals.dmb` in `PROGRAM/2333_%08d/`. Written from their sources (github.com/GhiXu, `main.cpp` and `ACM*.cpp`):
+
+- Image numbers are positions in `pair.txt`, so those with source views are numbered without gaps.
+- The centre of the top-left pixel is (0, 0), where COLMAP's is (0.5, 0.5).
+- Depths are searched from 0.6 times the least to 1.2 times the greatest of the camera file.
+- Normals come out in the world's frame; COLMAP wants the camera's.
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvs_backends.base import Availability, MvsBackend, MvsError, MvsJob, MvsOptions, Progress
+from mvs_backends.colmap_maps import has_maps, write_maps
+from mvs_backends.depth_range import depth_range, view_depth_range
+from mvs_backends.masks import read_mask
+from mvs_backends.process import find_program, run_subprocess
+
+PROGRAMS = ("ACMP", "ACMH", "ACMM", "ACMMP")
+_MAX_IMAGE_SIZE_PX = 3200
+_NUM_SOURCES = 8
+_SEARCHED_FROM, _SEARCHED_TO = 0.6, 1.2
+_NUM_DEPTHS = 192
+
+
+class Acm(MvsBackend):
+    """One of the programs."""
+
+    def __init__(self, program: str) -> None:
+        self._program = program
+
+    def availability(self, options: MvsOptions) -> Availability:
+        """Whether the executable is there; it says itself if it finds no GPU."""
+        found = find_program(self._program, options.acmp_path)
+        if found is not None:
+            return Availability(ok=True, reason=f"{found} (whether it finds a GPU shows when it runs)")
+        where = f"at {options.acmp_path}" if options.acmp_path else "on PATH"
+        return Availability(
+            ok=False, reason=f"no executable {self._program} {where}; build it and set --acmp-path, or use patchmatch"
+        )
+
+    def estimate(self, *, job: MvsJob, options: MvsOptions, num_threads: int, progress: Progress | None = None) -> None:
+        """See `MvsBackend.estimate`."""
+        executable = find_program(self._program, options.acmp_path)
+        if executable is None:
+            raise MvsError(self.availability(options).reason)
+        ranges = [view_depth_range(job, view) for view in range(len(job.views))]
+        used = [view for view in range(len(job.views)) if job.sources[view] and ranges[view] is not None]
+        for view in range(len(job.views)):
+            if view not in used:
+                _write_empty(job, view)
+        if all(has_maps(job, view) for view in used):
+            return
+        folder = job.workspace / "stereo" / self._program.lower()
+        shutil.rmtree(folder, ignore_errors=True)
+        write_folder(folder, job, used, num_sources=options.num_source_views or _NUM_SOURCES)
+        results = [folder / self._program / f"2333_{number:08d}" for number in range(len(used))]
+
+        def count() -> None:
+            if progress is not None:
+                # Photometric and geometric passes write the same files again: half of the work each.
+                done = sum((result / name).exists() for result in results for name in ("depths.dmb", "depths_geom.dmb"))
+                progress(done // 2, len(results))
+
+        run_subprocess(
+            [executable, folder],
+            log_file=job.workspace / "stereo" / f"{self._program.lower()}.log",
+            timeout_s=options.program_timeout_s,
+            on_wait=count,
+        )
+        for view, result in zip(used, results, strict=True):
+            depth = read_dmb(result / "depths_geom.dmb", job.views[view].height, job.views[view].width, 1)[..., 0]
+            normal = read_dmb(result / "normals.dmb", job.views[view].height, job.views[view].width, 3)
+            _write_result(job, view, depth, normal)
+        shutil.rmtree(folder)
+
+
+def write_folder(folder: Path, job: MvsJob, used: list[int], *, num_sources: int) -> None:
+    """Write a job as the programs read it.
+
+    Args:
+        folder: to create.
+        job: the job.
+        used: reference views with source views, in the order of their numbers.
+        num_sources: source views per reference view, at most.
+
+    Raises:
+        MvsError: images are larger than the programs work on.
+    """
+    number = {view: row for row, view in enumerate(used)}
+    for name in ("images", "cams"):
+        (folder / name).mkdir(parents=True)
+    pairs = [f"{len(used)}\n"]
+    for view in used:
+        camera = job.views[view]
+        if max(camera.width, camera.height) > _MAX_IMAGE_SIZE_PX:
+            raise MvsError(
+                f"{camera.name} has {camera.width}x{camera.height} pixels, ACMP works on {_MAX_IMAGE_SIZE_PX} at most; "
+                f"set --max-image-size-px {_MAX_IMAGE_SIZE_PX}"
+            )
+        # OpenCV, which reads them there, goes by the content of a file and not by its suffix.
+        (folder / "images" / f"{number[view]:08d}.jpg").symlink_to(job.image_path(view).absolute())
+        found = view_depth_range(job, view)
+        assert found is not None, "checked by the caller"
+        (folder / "cams" / f"{number[view]:08d}_cam.txt").write_text(_camera_text(job, view, *found), encoding="ascii")
+        sources = [number[source] for source in job.sources[view] if source in number][:num_sources]
+        scores = "".join(f" {source} {len(sources) - rank}" for rank, source in enumerate(sources))
+        pairs.append(f"{number[view]}\n{len(sources)}{scores}\n")
+    (folder / "pair.txt").write_text("".join(pairs), encoding="ascii")
+
+
+def _camera_text(job: MvsJob, view: int, near: float, far: float) -> str:
+    camera = job.views[view]
+    extrinsic = np.vstack([camera.cam_from_world, [0.0, 0.0, 0.0, 1.0]])
+    intrinsic = camera.calibration.copy()
+    intrinsic[:2, 2] -= 0.5
+    low, high = near / _SEARCHED_FROM, max(far / _SEARCHED_TO, 1.01 * near / _SEARCHED_FROM)
+    interval = (high - low) / (_NUM_DEPTHS - 1)
+    depths = f"{low:.9g} {interval:.9g} {_NUM_DEPTHS} {high:.9g}"
+    return f"extrinsic\n{_rows(extrinsic)}\nintrinsic\n{_rows(intrinsic)}\n{depths}\n"
+
+
+def _rows(matrix: NDArray[np.float64]) -> str:
+    return "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in matrix)
+
+
+def read_dmb(path: Path, height: int, width: int, channels: int) -> NDArray[np.float32]:
+    """Read a map: int32 type (1: float32), height, width, channels; then the values row by row.
+
+    Returns:
+        (height, width, channels)
+
+    Raises:
+        MvsError: missing, or not of this shape.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise MvsError(f"{path} was not written: {error.strerror}; see the log beside its folder") from error
+    header = tuple(np.frombuffer(data[:16], "<i4").tolist()) if len(data) >= 16 else ()
+    if header != (1, height, width, channels) or len(data) != 16 + 4 * height * width * channels:
+        raise MvsError(f"{path} is no map of {width}x{height} pixels with {channels} channels; see the log beside it")
+    return np.frombuffer(data, "<f4", offset=16).reshape(height, width, channels)
+
+
+def _write_result(job: MvsJob, view: int, depth: NDArray[np.float32], normal_in_world: NDArray[np.float32]) -> None:
+    """Leave COLMAP's maps of what lies in the region and is not masked."""
+    camera = job.views[view]
+    entry, leave = depth_range(camera, job.boxes_in_world, camera.width, camera.height)
+    length = np.linalg.norm(normal_in_world, axis=-1)
+    wanted = np.isfinite(depth) & (depth > 0) & (depth >= entry) & (depth <= leave) & (np.abs(length - 1) < 0.1)
+    mask = read_mask(job, view, camera.width, camera.height)
+    if mask is not None:
+        wanted &= mask
+    normal = np.where(wanted[..., None], normal_in_world / np.where(wanted, length, 1)[..., None], 0)
+    normal = (normal @ camera.cam_from_world[:, :3].T.astype(np.float32)).astype(np.float32)
+    write_maps(job, view, np.where(wanted, depth, 0).astype(np.float32), normal)
+
+
+def _write_empty(job: MvsJob, view: int) -> None:
+    shape = job.views[view].height, job.views[view].width
+    write_maps(job, view, np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float32))
