@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pycolmap
@@ -16,6 +16,7 @@ from app.densify import Task, densify_inputs, densify_job, fuse_inputs, fuse_job
 from app.errors import CityReconError, InputError
 from app.executor import split_cores
 from app.log import ProgressLine
+from app.options import DensifyOptions
 from app.run import Run
 from app.scene.read_model import read_posed_scene
 from app.stage import finished_product, is_current, run_stage
@@ -23,7 +24,7 @@ from app.view_selection.selection import read_selections
 from app.workspace import atomic_file, remove_tree
 from fusion.merge import merge_clouds
 from fusion.region import GroundRegion
-from mvs_backends import get_backend
+from mvs_backends import choose_backend, get_backend
 
 logger = logging.getLogger(__name__)
 
@@ -114,7 +115,8 @@ def densify_stage(run: Run, *, jobs: Mapping[str, Path], folder: Path, num_jobs:
     """
     check_backend(run)
     inventory = Inventory.read(run.workspace.inventory_file)
-    num_workers, num_threads = split_cores(len(jobs), num_jobs)
+    densify = _densify(run)
+    num_workers, num_threads = split_cores(len(jobs), 1 if get_backend(densify.backend).uses_gpu else num_jobs)
     tasks = {
         name: Task(
             folder=folder / name,
@@ -125,7 +127,7 @@ def densify_stage(run: Run, *, jobs: Mapping[str, Path], folder: Path, num_jobs:
                 folder / name,
                 inventory.image_root,
                 inventory.mask_root,
-                run.config.densify,
+                densify,
                 run.config.stereo,
                 num_threads,
             ),
@@ -144,12 +146,13 @@ def check_backend(run: Run) -> None:
         InputError: no such back-end.
         CityReconError: it can't run here.
     """
+    name = _densify(run).backend
     try:
-        availability = get_backend(run.config.densify.backend).availability(run.config.stereo)
+        availability = get_backend(name).availability(run.config.stereo)
     except ValueError as error:
         raise InputError(str(error)) from error
     if not availability.ok:
-        raise CityReconError(f"back-end {run.config.densify.backend} can't run here: {availability.reason}")
+        raise CityReconError(f"back-end {name} can't run here: {availability.reason}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,8 +183,14 @@ def densify_work(run: Run, *, jobs: Mapping[str, Path], folder: Path) -> Densify
     )
 
 
+def _densify(run: Run) -> DensifyOptions:
+    """The options with the back-end that `auto` means here: a workspace's maps all come from one."""
+    densify = run.config.densify
+    return replace(densify, backend=choose_backend(densify.backend, run.config.stereo))
+
+
 def _densify_options(run: Run) -> dict[str, object]:
-    return {"densify": run.config.densify, "stereo": run.config.stereo}
+    return {"densify": _densify(run), "stereo": run.config.stereo}
 
 
 def fuse_stage(

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 class DensifyOptions:
     """Which back-end makes the depth maps, and at what size."""
 
-    backend: str = "patchmatch"
-    """Name of the dense back-end; `cityrecon doctor` lists those that can run here."""
+    backend: str = "auto"
+    """Dense back-end; `cityrecon doctor` lists those that can run here. auto: colmap if its CUDA works, else
+    patchmatch."""
     max_image_size_px: int = 1600
     """Longer side of the undistorted images that stereo works on; larger images are reduced. 0: no limit."""
     skip_sky: bool = True

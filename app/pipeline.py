@@ -182,7 +182,7 @@ def batch_reconstruction(run: Run, *, out: Path, dry_run: bool = False) -> None:
 def _log_work(run: Run, jobs: Mapping[str, Path], folder: Path) -> None:
     work = densify_work(run, jobs=jobs, folder=folder)
     logger.info(
-        "densify: %d of %d jobs to do, %d depth maps of %.1f megapixels in all with %s",
+        "densify: %d of %d jobs to do, %d depth maps of %.1f megapixels in all; back-end %s",
         work.num_jobs,
         len(jobs),
         work.num_views,

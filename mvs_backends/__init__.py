@@ -10,18 +10,27 @@ from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 
 from mvs_backends.acm import PROGRAMS, Acm
-from mvs_backends.base import MvsBackend
+from mvs_backends.base import MvsBackend, MvsOptions
+from mvs_backends.colmap import Colmap
 from mvs_backends.patchmatch.backend import PatchMatch
 
 _BUILT_IN: dict[str, Callable[[], MvsBackend]] = {
     "patchmatch": PatchMatch,
+    "colmap": Colmap,
     **{program.lower(): partial(Acm, program) for program in PROGRAMS},
 }
 
 
 def backend_names() -> tuple[str, ...]:
-    """Valid back-end names: our own, then those of other packages."""
+    """Names of back-ends: our own, then those of other packages."""
     return (*_BUILT_IN, *(name for name in sorted(_entry_points()) if name not in _BUILT_IN))
+
+
+def choose_backend(name: str, options: MvsOptions) -> str:
+    """The name itself, but for `auto`: `colmap` if CUDA really works here, else `patchmatch`."""
+    if name != "auto":
+        return name
+    return "colmap" if get_backend("colmap").availability(options).ok else "patchmatch"
 
 
 def get_backend(name: str) -> MvsBackend:
@@ -34,7 +43,7 @@ def get_backend(name: str) -> MvsBackend:
         return _BUILT_IN[name]()
     found = _entry_points().get(name)
     if found is None:
-        raise ValueError(f"no back-end {name!r}; choose one of: {', '.join(backend_names())}")
+        raise ValueError(f"no back-end {name!r}; choose one of: auto, {', '.join(backend_names())}")
     try:
         backend = found.load()()
     except (ImportError, AttributeError) as error:

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvs_backends.base import Availability, MvsBackend, MvsError, MvsJob, MvsOptions, Progress
-from mvs_backends.colmap_maps import has_maps, write_maps
-from mvs_backends.depth_range import depth_range, view_depth_range
-from mvs_backends.masks import read_mask
+from mvs_backends.colmap_maps import has_maps, write_empty_maps, write_wanted_maps
+from mvs_backends.depth_range import view_depth_range
 from mvs_backends.process import find_program, run_subprocess
 
 PROGRAMS = ("ACMP", "ACMH", "ACMM", "ACMMP")
@@ -32,6 +31,8 @@ _NUM_DEPTHS = 192
 
 class Acm(MvsBackend):
     """One of the programs."""
+
+    uses_gpu = True
 
     def __init__(self, program: str) -> None:
         self._program = program
@@ -55,7 +56,7 @@ class Acm(MvsBackend):
         used = [view for view in range(len(job.views)) if job.sources[view] and ranges[view] is not None]
         for view in range(len(job.views)):
             if view not in used:
-                _write_empty(job, view)
+                write_empty_maps(job, view)
         if all(has_maps(job, view) for view in used):
             return
         folder = job.workspace / "stereo" / self._program.lower()
@@ -78,7 +79,7 @@ class Acm(MvsBackend):
         for view, result in zip(used, results, strict=True):
             depth = read_dmb(result / "depths_geom.dmb", job.views[view].height, job.views[view].width, 1)[..., 0]
             normal = read_dmb(result / "normals.dmb", job.views[view].height, job.views[view].width, 3)
-            _write_result(job, view, depth, normal)
+            write_wanted_maps(job, view, depth, normal @ job.views[view].cam_from_world[:, :3].T.astype(np.float32))
         shutil.rmtree(folder)
 
 
@@ -148,22 +149,3 @@ def read_dmb(path: Path, height: int, width: int, channels: int) -> NDArray[np.f
     if header != (1, height, width, channels) or len(data) != 16 + 4 * height * width * channels:
         raise MvsError(f"{path} is no map of {width}x{height} pixels with {channels} channels; see the log beside it")
     return np.frombuffer(data, "<f4", offset=16).reshape(height, width, channels)
-
-
-def _write_result(job: MvsJob, view: int, depth: NDArray[np.float32], normal_in_world: NDArray[np.float32]) -> None:
-    """Leave COLMAP's maps of what lies in the region and is not masked."""
-    camera = job.views[view]
-    entry, leave = depth_range(camera, job.boxes_in_world, camera.width, camera.height)
-    length = np.linalg.norm(normal_in_world, axis=-1)
-    wanted = np.isfinite(depth) & (depth > 0) & (depth >= entry) & (depth <= leave) & (np.abs(length - 1) < 0.1)
-    mask = read_mask(job, view, camera.width, camera.height)
-    if mask is not None:
-        wanted &= mask
-    normal = np.where(wanted[..., None], normal_in_world / np.where(wanted, length, 1)[..., None], 0)
-    normal = (normal @ camera.cam_from_world[:, :3].T.astype(np.float32)).astype(np.float32)
-    write_maps(job, view, np.where(wanted, depth, 0).astype(np.float32), normal)
-
-
-def _write_empty(job: MvsJob, view: int) -> None:
-    shape = job.views[view].height, job.views[view].width
-    write_maps(job, view, np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float32))

@@ -86,10 +86,18 @@ class MvsOptions:
     """Seed of the random search; same seed, same bytes, for any number of threads."""
     acmp_path: str = ""
     """Executable of ACMP, ACMH, ACMM or ACMMP, or the folder that holds it. Empty: searched on PATH."""
+    colmap_path: str = ""
+    """COLMAP's executable built with CUDA, or its folder. Empty: pycolmap if it has CUDA, else searched on PATH."""
+    gpu_index: str = "-1"
+    """GPUs for COLMAP, comma-separated; -1: all."""
+    cache_gib: float = 16.0
+    """Memory that COLMAP may keep images and maps in."""
     program_timeout_s: float = 0.0
     """A back-end's program is stopped if it works longer than this on one cluster. 0: never."""
 
     def __post_init__(self) -> None:
+        if not self.cache_gib > 0:
+            raise ValueError(f"cache_gib must be above 0, not {self.cache_gib}")
         if not self.program_timeout_s >= 0:
             raise ValueError(f"program_timeout_s must be at least 0, not {self.program_timeout_s}")
         if self.num_source_views < 0:
@@ -107,7 +115,8 @@ class Availability:
 class MvsBackend(ABC):
     """A dense multi-view stereo method. Stateless: one instance serves any number of jobs."""
 
-    name: ClassVar[str]
+    uses_gpu: ClassVar[bool] = False
+    """Clusters are then reconstructed one after the other."""
 
     @abstractmethod
     def availability(self, options: MvsOptions) -> Availability:

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvs_backends.base import MvsJob
+from mvs_backends.depth_range import depth_range
+from mvs_backends.masks import read_mask
 
 
 def write_map(path: Path, values: NDArray[np.float32]) -> None:
@@ -43,3 +45,42 @@ def write_maps(job: MvsJob, view: int, depth: NDArray[np.float32], normal: NDArr
 def has_maps(job: MvsJob, view: int) -> bool:
     """Whether both maps of a reference view are there."""
     return job.normal_map_path(view).exists() and job.depth_map_path(view).exists()
+
+
+def read_map(path: Path) -> NDArray[np.float32]:
+    """Read a depth map (H, W) or a normal map (H, W, 3).
+
+    Raises:
+        OSError: it isn't there.
+        ValueError: it isn't whole.
+    """
+    width, height, depth, data = path.read_bytes().split(b"&", 3)
+    planes = np.frombuffer(data, "<f4").reshape(int(depth), int(height), int(width))
+    values = planes.transpose(1, 2, 0)
+    return np.array(values[..., 0] if planes.shape[0] == 1 else values)
+
+
+def write_wanted_maps(job: MvsJob, view: int, depth: NDArray[np.float32], normal: NDArray[np.float32]) -> None:
+    """Leave what lies in the region, is not masked, and has a depth and a normal.
+
+    Args:
+        job: the job.
+        view: reference view.
+        depth: (H, W) camera z; anything where unknown.
+        normal: (H, W, 3) in the camera's frame, of unit length where known.
+    """
+    camera = job.views[view]
+    entry, leave = depth_range(camera, job.boxes_in_world, camera.width, camera.height)
+    length = np.linalg.norm(normal, axis=-1)
+    wanted = np.isfinite(depth) & (depth > 0) & (depth >= entry) & (depth <= leave) & (np.abs(length - 1) < 0.1)
+    mask = read_mask(job, view, camera.width, camera.height)
+    if mask is not None:
+        wanted &= mask
+    unit = np.where(wanted[..., None], normal / np.where(wanted, length, 1)[..., None], 0)
+    write_maps(job, view, np.where(wanted, depth, 0).astype(np.float32), unit.astype(np.float32))
+
+
+def write_empty_maps(job: MvsJob, view: int) -> None:
+    """Leave maps of a view of which nothing is known."""
+    shape = job.views[view].height, job.views[view].width
+    write_maps(job, view, np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float32))

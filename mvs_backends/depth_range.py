@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 from mvs_backends.base import MvsJob, MvsView
 
+_RANGE_MARGIN = 0.02
+
 
 def depth_range(
     view: MvsView, boxes_in_world: NDArray[np.float64], width: int, height: int
@@ -67,4 +69,5 @@ def view_depth_range(job: MvsJob, view: int) -> tuple[float, float] | None:
         depths = points @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
         depths = depths[depths > 0.0]
         near = 0.5 * float(depths.min()) if len(depths) else 0.01 * far
-    return min(near, 0.5 * far), far
+    # A few rays stand for all.
+    return (1 - _RANGE_MARGIN) * min(near, 0.5 * far), (1 + _RANGE_MARGIN) * far

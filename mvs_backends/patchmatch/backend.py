@@ -10,7 +10,6 @@ import time
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
-from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -40,8 +39,6 @@ logger = logging.getLogger(__name__)
 
 class PatchMatch(MvsBackend):
     """PatchMatch stereo on the CPU after ACMP (Xu & Tao 2020) and ACMM (2019), bounded by the cluster's region."""
-
-    name: ClassVar[str] = "patchmatch"
 
     def availability(self, options: MvsOptions) -> Availability:
         """Always: it needs nothing but this package."""
