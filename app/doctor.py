@@ -12,8 +12,8 @@ from pathlib import Path
 from app.executor import available_cores
 from fusion.errors import FusionError
 from fusion.open3d_import import import_open3d
-from mvs_backends import backend_names, get_backend
-from mvs_backends.base import MvsOptions
+from mvs_backends import backend_names, choose_backend, get_backend
+from mvs_backends.base import Availability, MvsOptions
 
 _PACKAGES = (
     ("numpy", "numpy"),
@@ -43,8 +43,12 @@ def diagnose() -> str:
         lines.append(f"  {distribution:24}{_version(distribution):14}{problem or 'works'}")
     lines += ["", "dense back-ends"]
     for name in backend_names():
-        availability = get_backend(name).availability(MvsOptions())
+        try:
+            availability = get_backend(name).availability(MvsOptions())
+        except ValueError as error:
+            availability = Availability(ok=False, reason=str(error))
         lines.append(f"  {name:24}{'yes' if availability.ok else 'no':14}{availability.reason}")
+    lines.append(f"  {'auto':24}{'':14}takes {choose_backend('auto', MvsOptions())} here")
     return "\n".join(lines)
 
 

@@ -45,12 +45,12 @@ def get_backend(name: str) -> MvsBackend:
     if found is None:
         raise ValueError(f"no back-end {name!r}; choose one of: auto, {', '.join(backend_names())}")
     try:
-        backend = found.load()()
+        backend = found.load()
     except (ImportError, AttributeError) as error:
         raise ValueError(f"back-end {name!r} of {found.value} doesn't load: {error}") from error
-    if not isinstance(backend, MvsBackend):
-        raise ValueError(f"back-end {name!r}: {found.value} is no MvsBackend")
-    return backend
+    if not (isinstance(backend, type) and issubclass(backend, MvsBackend)):
+        raise ValueError(f"back-end {name!r}: {found.value} is no subclass of MvsBackend")
+    return backend()
 
 
 def _entry_points() -> dict[str, EntryPoint]:
