@@ -365,7 +365,14 @@ def _onto_gps(
     transform = np.column_stack((scale * rotation, (fit.offset_m.real, fit.offset_m.imag, shift)))
     horizontal = fit.residuals_m[fit.inliers]
     if fit.lever_m:
-        logger.info("the GPS antenna is %.2f m right and %.2f m in front of the camera", *_parts(fit.lever_m))
+        right, ahead = _parts(fit.lever_m)
+        logger.info(
+            "the GPS antenna is %.2f m %s and %.2f m %s the camera",
+            abs(right),
+            "right" if right >= 0 else "left",
+            abs(ahead),
+            "in front of" if ahead >= 0 else "behind",
+        )
     residuals = Residuals(
         num_frames=len(gps.rows),
         num_inliers=int(fit.inliers.sum()),
