@@ -91,7 +91,11 @@ def _reference_cameras(
     num_frames: int,
     is_rig: bool,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(F, 3) centre and (F, 3) x axis of each frame's reference camera."""
+    """(F, 3) centre and (F, 3) x axis of each frame's reference camera.
+
+    In a rig every camera says where the reference camera is; the centre is the median of that, so that one camera with
+    a bad track doesn't bend the drive.
+    """
     centers = scene.centers_in_world
     rotations = scene.cam_from_world[:, :, :3]
     num_cameras = int(image_cameras.max()) + 1
@@ -100,6 +104,7 @@ def _reference_cameras(
     row[image_cameras[known], image_frames[known]] = known
     positions = np.full((num_frames, 3), np.nan)
     right = np.full((num_frames, 3), np.nan)
+    said = np.full((num_cameras, num_frames, 3), np.nan)
     # The camera with the most images first, so that most offsets come from many frames.
     order = np.argsort(-(row >= 0).sum(axis=1), kind="stable")
     for camera in order:
@@ -114,10 +119,11 @@ def _reference_cameras(
             from_camera = rotations[rows].transpose(0, 2, 1)
             estimate = estimate + from_camera @ offset
             axes = from_camera @ (axis / np.linalg.norm(axis))
+        said[camera, here] = estimate
         missing = ~np.isfinite(positions[here, 0])
         positions[np.flatnonzero(here)[missing]] = estimate[missing]
         right[np.flatnonzero(here)[missing]] = axes[missing]
-    return positions, right
+    return np.nanmedian(said, axis=0) if is_rig else positions, right
 
 
 def _rotate(rotations: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -191,7 +191,7 @@ def test_gravity_from_cameras_and_ground(
     centers = [model.find_image_with_name(f"cam0/{frame:06d}.jpg").projection_center() for frame in range(20)]
     spacing = np.linalg.norm(np.diff(centers, axis=0), axis=1)
     assert np.median(spacing) == pytest.approx(1.0)
-    assert np.allclose(centers[0][:2], 0.0, atol=1e-9)
+    assert np.allclose(centers[0][:2], 0.0, atol=1e-3)
     assert centers[0][2] == pytest.approx(HEIGHT_M / 1.5, rel=0.03)
 
 
