@@ -12,11 +12,13 @@ from importlib.metadata import EntryPoint, entry_points
 from mvs_backends.acm import PROGRAMS, Acm
 from mvs_backends.base import MvsBackend, MvsOptions
 from mvs_backends.colmap import Colmap
+from mvs_backends.openmvs import OpenMvs
 from mvs_backends.patchmatch.backend import PatchMatch
 
 _BUILT_IN: dict[str, Callable[[], MvsBackend]] = {
     "patchmatch": PatchMatch,
     "colmap": Colmap,
+    "openmvs": OpenMvs,
     **{program.lower(): partial(Acm, program) for program in PROGRAMS},
 }
 

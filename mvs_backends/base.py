@@ -86,6 +86,8 @@ class MvsOptions:
     """Seed of the random search; same seed, same bytes, for any number of threads."""
     acmp_path: str = ""
     """Executable of ACMP, ACMH, ACMM or ACMMP, or the folder that holds it. Empty: searched on PATH."""
+    openmvs_path: str = ""
+    """Folder that holds OpenMVS's programs. Empty: searched on PATH."""
     colmap_path: str = ""
     """COLMAP's executable built with CUDA, or its folder. Empty: pycolmap if it has CUDA, else searched on PATH."""
     gpu_index: str = "-1"
