@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from app.config import read_config
 from app.densify import densify_inputs
 from app.stage import is_current
 from app.workspace import Workspace
+from mvs_backends import choose_backend
 from tests.small_street import OPTIONS, FinishedRun, cityrecon, error_lines, kill_when, refused
 
 KILL_IN_MERGE = """
@@ -163,7 +165,8 @@ def test_a_selection_option_redoes_the_clusters_whose_views_changed(finished_run
     changed = {name for name in after if after[name] != before.get(name)}
     assert changed, "choose an option that changes more"
     config = read_config(Workspace(workspace).config_file)
-    options = {"densify": config.densify, "stereo": config.stereo}
+    backend = choose_backend(config.densify.backend, config.stereo)
+    options = {"densify": replace(config.densify, backend=backend), "stereo": config.stereo}
     current = {
         name
         for name in after
