@@ -212,6 +212,25 @@ def compare(
 
 
 @app.command()
+def explain(
+    workspace: WorkspaceArgument,
+    clusters: Annotated[
+        list[str] | None, typer.Argument(metavar="[CLUSTER]...", help="Clusters to explain. Default: a table of all.")
+    ] = None,
+    verbose: VerboseOption = False,
+) -> None:
+    """Say why each view of a cluster was selected, what was relaxed, and what is covered before and after."""
+    from app.explain import explain as explain_clusters
+    from app.workspace import Workspace
+
+    def work() -> None:
+        for line in explain_clusters(Workspace(workspace.absolute()), clusters or []):
+            typer.echo(line)
+
+    run_safely(work, verbosity=int(verbose))
+
+
+@app.command()
 def doctor() -> None:
     """Say what is installed, and which back-ends can run here and why not."""
     from app.doctor import diagnose

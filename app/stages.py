@@ -142,13 +142,14 @@ def cluster_stage(run: Run) -> None:
 
 def select_stage(run: Run) -> None:
     """Choose the smallest set of views of each cluster that still sees and matches everything ([O] section 4)."""
+    from app.view_selection.selection import FORMAT_VERSION
     from app.view_selection.stage import select
 
     clusters_product = finished_product(run.workspace.root / "clusters", "cluster")
     run_stage(
         run.workspace.root / "selection",
         options=run.config.selection,
-        inputs={"clusters": clusters_product},
+        inputs={"clusters": clusters_product, "format": str(FORMAT_VERSION)},
         work=lambda partial: select(
             run.workspace.georegistered_model,
             run.workspace.root / "clusters",

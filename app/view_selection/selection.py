@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import InputError
+from app.view_selection.explanation import Explanation, explain_selection
 from app.view_selection.ilp import Solution, ViewProgram, best_selection, smallest_selection
 from app.view_selection.options import SelectionMethod, SelectionOptions
 from app.view_selection.problem import ViewProblem
@@ -19,6 +20,7 @@ from app.view_selection.reduction import CoveringRows, covering_rows, reduce_row
 from app.view_selection.visibility import matching_views, pack_rows, unpack_rows, visible_points
 
 FILE_NAME = "selection.jsonl"
+FORMAT_VERSION = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +42,8 @@ class Selection:
     """N_min."""
     size_bound: int
     """No selection that meets the constraints has fewer views."""
+    explanation: Explanation
+    """What keeps each selected view, and what they cover."""
     quality: float = 0.0
     """Total view quality; 0 where the method doesn't ask for it."""
     quality_bound: float = 0.0
@@ -76,15 +80,29 @@ def select_views(problem: ViewProblem, options: SelectionOptions) -> Selection:
     relaxed = _relaxations(num_seen_by, n_match, wanted, int(usable.sum()), options)
     min_views = min(wanted, int(usable.sum()))
 
-    program = _program(rows, matches, usable, n_match, min_views, _forced_views(num_seen, usable, min_views, options))
-    preference = num_seen.astype(np.float64)
+    forced = _forced_views(num_seen, usable, min_views, options)
+    program = _program(rows, matches, usable, n_match, min_views, forced)
+    quality = viewpoint = None
     if options.method is SelectionMethod.OPTIMAL:
-        preference = view_quality(problem, visible)
+        quality, viewpoint = view_quality(problem, visible), viewpoints(problem, visible)
+    preference = num_seen.astype(np.float64) if quality is None else quality
     solution = smallest_selection(program, preference, options.max_solver_nodes)
-    if options.method is SelectionMethod.OPTIMAL:
-        viewpoint = viewpoints(problem, visible)
-        solution = best_selection(program, solution, preference, viewpoint, options.max_solver_nodes)
-    return _selection(problem, program, solution, relaxed, num_points=len(visible))
+    if quality is not None and viewpoint is not None:
+        solution = best_selection(program, solution, quality, viewpoint, options.max_solver_nodes)
+    explanation = explain_selection(
+        selected=solution.selected,
+        visible=visible,
+        num_keypoints=len(problem.keypoints_in_world),
+        usable=usable,
+        forced=forced,
+        matches=matches,
+        n_vis=options.n_vis,
+        n_match=n_match,
+        min_views=min_views,
+        quality=quality,
+        viewpoint=viewpoint,
+    )
+    return _selection(problem, program, solution, relaxed, explanation, num_points=len(visible))
 
 
 def _usable_views(matches: NDArray[np.bool_], n_match: int) -> tuple[NDArray[np.bool_], int]:
@@ -148,7 +166,13 @@ def _relaxations(
 
 
 def _selection(
-    problem: ViewProblem, program: ViewProgram, solution: Solution, relaxed: tuple[str, ...], *, num_points: int
+    problem: ViewProblem,
+    program: ViewProgram,
+    solution: Solution,
+    relaxed: tuple[str, ...],
+    explanation: Explanation,
+    *,
+    num_points: int,
 ) -> Selection:
     reasons = {
         f"matches fewer than {max(program.n_match, 1)} usable views": ~program.usable,
@@ -163,6 +187,7 @@ def _selection(
         num_rows=len(program.rows.bounds),
         min_views=program.min_views,
         size_bound=solution.size_bound,
+        explanation=explanation,
         quality=solution.quality,
         quality_bound=solution.quality_bound,
     )
@@ -193,6 +218,7 @@ def read_selections(folder: Path) -> Iterator[Selection]:
                 for name in ("image_names", "relaxed"):
                     record[name] = tuple(record[name])
                 record["not_selected"] = {why: tuple(names) for why, names in record["not_selected"].items()}
+                record["explanation"] = Explanation.from_record(record["explanation"])
                 yield Selection(**record)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}; run `cityrecon select` first") from error

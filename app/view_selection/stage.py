@@ -16,6 +16,7 @@ from typing import Any
 from app.clustering.clusters import Clustering
 from app.executor import die_with_parent
 from app.scene.read_model import read_posed_scene
+from app.view_selection.explanation import ExplanationSums
 from app.view_selection.options import SelectionOptions
 from app.view_selection.problem import ProblemCutter, ViewProblem
 from app.view_selection.selection import Selection, select_views, write_selections
@@ -55,6 +56,7 @@ def select(
     num_clusters = len(clustering.clusters)
     num_workers = max(1, min(num_workers, num_clusters // _MIN_CLUSTERS_PER_WORKER))
     totals = Counter[str]()
+    explained = ExplanationSums()
     gaps: dict[str, dict[str, float]] = {}
     empty: list[str] = []
 
@@ -62,6 +64,7 @@ def select(
         for done, selection in enumerate(_solved(problems, options, num_workers), start=1):
             totals["selected"] += len(selection.image_names)
             totals["relaxed"] += bool(selection.relaxed)
+            explained.add(selection.explanation)
             if selection.size_gap > 0 or selection.quality_gap > 0:
                 gaps[selection.cluster] = {"size": selection.size_gap, "quality": selection.quality_gap}
             if not selection.image_names:
@@ -80,6 +83,7 @@ def select(
         "clusters_per_image": totals["selected"] / len(scene.image_names),
         "images_per_cluster": totals["selected"] / num_clusters,
         "clusters_with_relaxed_constraints": totals["relaxed"],
+        **explained.record(),
         "clusters_not_proven_optimal": gaps,
         "clusters_without_stereo_pair": empty,
     }

@@ -69,6 +69,7 @@ def test_workspace_is_beside_the_output() -> None:
         (["full", "{tmp}/empty", "{tmp}/out.ply", "--config", "{tmp}/none.toml"], "cannot read"),
         (["cluster", "{tmp}/ws"], "cityrecon georegister"),
         (["select", "{tmp}/ws"], "cityrecon cluster"),
+        (["explain", "{tmp}/ws"], "cityrecon select"),
         (["densify", "{tmp}/ws"], "cityrecon"),
         (["cluster", "{tmp}/ws", "--overlap-m", "-1"], "overlap_m"),
         (["compare", "{tmp}/a.ply", "{tmp}/b.ply"], "a.ply"),
