@@ -1,0 +1,131 @@
+"""What hides a place from a camera, judged by sparse points and by the rays to them.
+
+A street in section, seen along it; the camera observes the points x, and r are its rays:
+
+      height
+        |   x______________ top of what is known: the highest point near by
+        |  r|##############|
+        | r |##############|      solid: no ray has passed here, and points show that something stands here
+        |r  |##############|
+     cam o r x#############|   other street
+        |_____|############|________________
+
+The ground is cut into square columns. Where a ray passes a column, it and all that lies above is free, as in a height
+field; what lies below the lowest ray or was passed by none is solid, but only up to the highest point near by, for
+nothing says that something stands where there are no points. So plain walls, which have no keypoints, close by
+themselves: no ray goes through them, and windows, doors and roof edges around tell their height.
+
+Rays as evidence of free space: Labatut, Pons & Keriven, Efficient Multi-View Reconstruction of Large-Scale Scenes using
+Interest Points, Delaunay Triangulation and Graph Cuts, 2007, section 3; Hornung et al., OctoMap, 2013, section 3.
+Height fields of streets: Gallup, Frahm & Pollefeys, A Heightmap Model for Efficient 3D Reconstruction from Street-Level
+Video, 2010. They weigh hits against misses; here a single ray frees a column, because a view that is kept in vain costs
+time, but one that is lost costs surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.occlusion.kernels import clear_blocked, lower_to_rays
+
+RAY_GAP = 0.5
+"""In columns: how far before its point a ray ends, because the point's depth is uncertain."""
+CLEARANCE = 0.5
+"""In columns: how far below its lowest ray a column is still free. Rays end at keypoints, and roads have few."""
+REACH = 2
+"""In columns: how far around a point columns may be as high as it is."""
+MAX_SOLID = 1.0
+"""In columns: what a line of sight may pass of solid, on the ground. A column at a wall is partly free, and keypoints
+lie up to their error behind it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolidColumns:
+    """How high the ground stands full of something that hides what is behind it; outside of it, nothing does."""
+
+    corner_m: tuple[float, float]
+    """Lowest x and y."""
+    column_m: float
+    """Side of a column."""
+    tops_m: NDArray[np.float64]
+    """(X, Y) height below which each column is solid; minus infinity where nothing is known to stand."""
+
+    def remove_hidden(
+        self, seen: NDArray[np.uint64], centers: NDArray[np.float64], points: NDArray[np.float64]
+    ) -> NDArray[np.uint64]:
+        """Remove the points that solid columns hide from a camera.
+
+        Args:
+            seen: (N, ceil(P / 64)) points in each camera's image; bit ``p % 64`` of word ``p // 64`` is point p.
+            centers: (N, 3) of the cameras, in the world.
+            points: (P, 3) in the world.
+
+        Returns:
+            (N, ceil(P / 64)) what is left of ``seen``.
+
+        Raises:
+            ValueError: shapes that don't belong together.
+        """
+        if seen.shape != (len(centers), -(-len(points) // 64)):
+            raise ValueError(f"{len(centers)} cameras and {len(points)} points don't fit bits of shape {seen.shape}")
+        left = seen.copy()
+        clear_blocked(left, self.tops_m, self._in_columns(centers), self._in_columns(points), MAX_SOLID)
+        return left
+
+    def _in_columns(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+        return _in_columns(positions, np.array(self.corner_m), self.column_m)
+
+
+def solid_columns(
+    points: NDArray[np.float64],
+    ray_points: NDArray[np.integer],
+    ray_centers: NDArray[np.float64],
+    *,
+    bounds_m: NDArray[np.float64],
+    column_m: float,
+) -> SolidColumns:
+    """Find what is solid in a rectangle. It doesn't depend on the order of points and rays.
+
+    Args:
+        points: (P, 3) keypoints in and around the rectangle.
+        ray_points: (T,) rows of the points that cameras observe.
+        ray_centers: (T, 3) where each of these cameras is. More rays never make more solid.
+        bounds_m: (2, 2) minimum and maximum (x, y): what is to be seen, and the cameras.
+        column_m: Side of the columns.
+    """
+    corner = bounds_m[0]
+    shape = tuple(int(side) for side in np.maximum(np.ceil((bounds_m[1] - corner) / column_m), 1))
+    points_in_columns = _in_columns(points, corner, column_m)
+    highest = np.full(shape, -np.inf)
+    cells = np.floor(points_in_columns[:, :2])
+    inside = np.all((cells >= 0) & (cells < shape), axis=1)
+    i, j = cells[inside].astype(np.int64).T
+    np.maximum.at(highest, (i, j), points_in_columns[inside, 2])
+
+    starts, ends = _in_columns(ray_centers, corner, column_m), points_in_columns[ray_points]
+    lengths_m = np.linalg.norm(ray_centers - points[ray_points], axis=1)
+    free = np.maximum(1 - RAY_GAP * column_m / np.maximum(lengths_m, np.finfo(np.float64).tiny), 0.0)
+    lowest_free = np.full(shape, np.inf)
+    lower_to_rays(lowest_free, starts, starts + free[:, None] * (ends - starts))
+    tops = np.minimum(lowest_free - CLEARANCE * column_m, _highest_around(highest, REACH))
+    return SolidColumns(corner_m=(float(corner[0]), float(corner[1])), column_m=column_m, tops_m=tops)
+
+
+def _in_columns(positions: NDArray[np.float64], corner: NDArray[np.float64], column_m: float) -> NDArray[np.float64]:
+    """(n, 3) x and y in columns from the corner; z stays."""
+    scaled = positions.astype(np.float64)
+    scaled[:, :2] = (scaled[:, :2] - corner) / column_m
+    return scaled
+
+
+def _highest_around(heights: NDArray[np.float64], reach: int) -> NDArray[np.float64]:
+    """Maximum over the square of columns at most ``reach`` away in x and y."""
+    for axis in (0, 1):
+        padding = [(0, 0), (0, 0)]
+        padding[axis] = (reach, reach)
+        padded = np.pad(heights, padding, constant_values=-np.inf)
+        heights = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=axis).max(axis=-1)
+    return heights
