@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from app.errors import CityReconError
 from app.options import DensifyOptions
+from app.scene.point_index import PointIndex
 from app.scene.posed_scene import PosedScene
 from app.scene.submodel import write_submodel
 from app.sky import find_sky
@@ -82,7 +83,8 @@ def write_dense_job(
     folder: Path,
     *,
     scene: PosedScene,
-    image_rows: Sequence[int],
+    points: PointIndex,
+    image_rows: NDArray[np.int64],
     region: GroundRegion,
     cameras: Sequence[pycolmap.Camera],
     digests: Mapping[str, str],
@@ -92,16 +94,19 @@ def write_dense_job(
     Args:
         folder: to create.
         scene: the posed model.
+        points: finds the scene's points.
         image_rows: rows of the scene's images that take part.
         region: what to reconstruct.
         cameras: the model's cameras before undistortion, one per row of the scene's cameras.
         digests: of images and masks, by image name.
     """
-    rows = np.asarray(sorted(image_rows), dtype=np.int64)
+    rows = np.sort(image_rows)
     low, high = region.padded_boxes()[:, 0].min(axis=0), region.padded_boxes()[:, 1].max(axis=0)
-    points = np.flatnonzero(np.all((scene.points_in_world >= low) & (scene.points_in_world <= high), axis=1))
+    point_rows = points.rows_between(low[:2], high[:2])
+    heights = scene.points_in_world[point_rows, 2]
+    point_rows = point_rows[(heights >= low[2]) & (heights <= high[2])]
     folder.mkdir(parents=True, exist_ok=True)
-    write_submodel(scene, rows, points, folder / "sparse")
+    write_submodel(scene, rows, point_rows, folder / "sparse")
     images = [
         JobImage(
             name=scene.image_names[row],

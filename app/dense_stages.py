@@ -7,8 +7,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import pycolmap
-
 from app.capture.inventory import Inventory
 from app.clustering.clusters import Clustering
 from app.dense_job import DenseJob, write_dense_job
@@ -18,7 +16,9 @@ from app.executor import split_cores
 from app.log import ProgressLine
 from app.options import DensifyOptions
 from app.run import Run
-from app.scene.read_model import read_posed_scene
+from app.scene.model_pieces import binary_model, read_cameras
+from app.scene.point_index import PointIndex
+from app.scene.read_model import open_scene
 from app.stage import finished_product, is_current, run_stage
 from app.view_selection.selection import read_selections
 from app.workspace import atomic_file, remove_tree
@@ -39,21 +39,23 @@ def _write_jobs(
     """
 
     def work(partial: Path) -> None:
-        scene = read_posed_scene(run.workspace.georegistered_model)
-        cameras = pycolmap.Reconstruction(str(run.workspace.georegistered_model)).cameras
+        scene = open_scene(run.workspace.scene)
+        points = PointIndex(scene.points_in_world)
+        with binary_model(run.workspace.georegistered_model) as model:
+            cameras = list(read_cameras(model, run.workspace.georegistered_model).values())
         digests = {
             image.name: image.digest + image.mask_digest
             for image in Inventory.read(run.workspace.inventory_file).images
         }
-        row_of_name = {name: row for row, name in enumerate(scene.image_names)}
         for name, (image_names, region) in jobs().items():
             remove_tree(partial / name)
             write_dense_job(
                 partial / name,
                 scene=scene,
-                image_rows=[row_of_name[image] for image in image_names],
+                points=points,
+                image_rows=scene.image_names.rows_of(image_names),
                 region=region,
-                cameras=[cameras[camera_id] for camera_id in sorted(cameras)],
+                cameras=cameras,
                 digests=digests,
             )
 
@@ -99,7 +101,7 @@ def batch_jobs(run: Run) -> dict[str, Path]:
             z_range_m=(min(r.z_range_m[0] for r in regions), max(r.z_range_m[1] for r in regions)),
             padding_m=regions[0].padding_m,
         )
-        return {"all": (read_posed_scene(run.workspace.georegistered_model).image_names, region)}
+        return {"all": (tuple(open_scene(run.workspace.scene).image_names), region)}
 
     return _write_jobs(run, run.workspace.root / "batch" / "jobs", jobs)
 

@@ -146,12 +146,12 @@ def select_stage(run: Run) -> None:
     from app.view_selection.stage import select
 
     clusters_product = finished_product(run.workspace.root / "clusters", "cluster")
+    model_product = finished_product(run.workspace.root / "georegister", "georegister")
     run_stage(
         run.workspace.root / "selection",
         options=run.config.selection,
-        inputs={"clusters": clusters_product, "format": str(FORMAT_VERSION)},
+        inputs={"clusters": clusters_product, "model": model_product, "format": str(FORMAT_VERSION)},
         work=lambda partial: select(
-            run.workspace.georegistered_model,
             run.workspace.root / "clusters",
             partial,
             options=run.config.selection,

@@ -59,6 +59,11 @@ class Workspace:
         return self.root / "clusters" / "clusters.jsonl"
 
     @property
+    def scene(self) -> Path:
+        """The georegistered model as arrays, in the order of the ground."""
+        return self.root / "clusters" / "scene"
+
+    @property
     def selection_file(self) -> Path:
         """One cluster's selected views per line."""
         return self.root / "selection" / "selection.jsonl"

@@ -24,6 +24,7 @@ import pycolmap
 
 from app.dense_job import prepare_workspace, write_dense_job
 from app.options import DensifyOptions
+from app.scene.point_index import PointIndex
 from app.scene.read_model import read_posed_scene
 from benchmarks.machine import describe_machine
 from fusion.cloud import read_ply
@@ -101,7 +102,15 @@ def _job(arguments: argparse.Namespace, frames: range, side_m: float) -> MvsJob:
     folder = arguments.work / f"job{side_m:g}"
     model = pycolmap.Reconstruction(str(arguments.model))
     cameras = [model.cameras[camera_id] for camera_id in sorted(model.cameras)]
-    write_dense_job(folder, scene=scene, image_rows=rows, region=region, cameras=cameras, digests={})
+    write_dense_job(
+        folder,
+        scene=scene,
+        points=PointIndex(scene.points_in_world),
+        image_rows=np.array(rows),
+        region=region,
+        cameras=cameras,
+        digests={},
+    )
     return prepare_workspace(
         folder,
         arguments.work / "workspace",

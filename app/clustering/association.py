@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.clustering.grid import Cell, CellIndex, GroundGrid
+from app.clustering.grid import Cell, GroundGrid
 from app.clustering.kernels import cameras_with_a_view
 from app.clustering.options import ClusteringOptions
 from app.clustering.samples import height_range, sample_axes
+from app.scene.point_index import PointIndex
 from app.scene.posed_scene import PosedScene
 from fusion.region import ground_cells
+
+_PIECE_POINTS = 1 << 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +29,7 @@ class Block:
     num_keypoints: int
     """In the cells, without the overlap."""
     z_range_m: tuple[float, float]
-    image_rows: NDArray[np.int64]
+    image_rows: NDArray[np.integer]
     """Ascending."""
 
 
@@ -65,49 +68,44 @@ def associate(scene: PosedScene, options: ClusteringOptions) -> Blocks:
         options: With lengths in the model's units.
     """
     centers = scene.centers_in_world
-    near, grid = _grid(scene.points_in_world, centers, options)
-    keypoints = scene.points_in_world[near]
-    num_far = len(near) - len(keypoints)
-    if len(keypoints) == 0:
-        return Blocks(grid=grid, kept=[], dropped=[], num_far_keypoints=num_far)
-
-    keypoint_cells = grid.cells_of(keypoints)
-    keypoint_index, camera_index = CellIndex(keypoint_cells), CellIndex(grid.cells_of(centers))
+    grid, cells, counts, num_far = _occupied_cells(scene.points_in_world, centers, options)
+    points, cameras = PointIndex(scene.points_in_world), PointIndex(centers)
     image_from_world, sizes_px = scene.image_from_world, scene.image_sizes_px
-    reach = tuple(math.ceil(options.max_camera_distance_m / side + 0.5) for side in options.block_size_m)
     kept, dropped = [], []
-    for i, j, count in zip(*_count_cells(keypoint_cells), strict=True):
-        cell = (int(i), int(j))
+    for cell, count in zip(map(tuple, cells.tolist()), counts.tolist(), strict=True):
         if count < options.min_keypoints_per_block:
-            dropped.append(DroppedBlock(cell=cell, num_keypoints=int(count), reason=DropReason.FEW_KEYPOINTS))
+            dropped.append(DroppedBlock(cell=cell, num_keypoints=count, reason=DropReason.FEW_KEYPOINTS))
             continue
-        around = keypoints[keypoint_index.rows_around(cell, (1, 1))]
+        center, size = grid.center_of(cell), np.array(options.block_size_m)
+        around = scene.points_in_world[points.rows_between(center - 1.5 * size, center + 1.5 * size)]
         z_range = height_range(
             around[:, 2],
-            centers[camera_index.rows_around(cell, (1, 1)), 2],
+            centers[cameras.rows_between(center - 1.5 * size, center + 1.5 * size), 2],
             quantiles=options.height_quantiles,
             margin=options.height_margin_m,
             camera_height=options.camera_height_m,
         )
         box = grid.region((cell,), z_range).padded_boxes()[0]
         box[:, 2] = z_range
-        inside = np.all((around[:, :2] >= box[0, :2]) & (around[:, :2] <= box[1, :2]), axis=1)
-        candidates = camera_index.rows_around(cell, (reach[0], reach[1]))
-        distances = np.hypot(*(centers[candidates, :2] - grid.center_of(cell)).T)
-        candidates = candidates[distances <= options.max_camera_distance_m]
-        x, y, z = sample_axes(box, options.sample_spacing_m)
-        with_view = cameras_with_a_view(around[inside], x, y, z, image_from_world[candidates], sizes_px[candidates])
+        x, y = around[:, 0], around[:, 1]
+        inside = (x >= box[0, 0]) & (x <= box[1, 0]) & (y >= box[0, 1]) & (y <= box[1, 1])
+        reach = options.max_camera_distance_m
+        candidates = cameras.rows_between(center - reach, center + reach)
+        candidates = candidates[np.hypot(*(centers[candidates, :2] - center).T) <= reach]
+        xs, ys, zs = sample_axes(box, options.sample_spacing_m)
+        with_view = cameras_with_a_view(around[inside], xs, ys, zs, image_from_world[candidates], sizes_px[candidates])
         if not with_view.any():
-            dropped.append(DroppedBlock(cell=cell, num_keypoints=int(count), reason=DropReason.NO_IMAGE))
+            dropped.append(DroppedBlock(cell=cell, num_keypoints=count, reason=DropReason.NO_IMAGE))
             continue
-        kept.append(Block(cells=(cell,), num_keypoints=int(count), z_range_m=z_range, image_rows=candidates[with_view]))
+        image_rows = candidates[with_view].astype(np.int32)
+        kept.append(Block(cells=(cell,), num_keypoints=count, z_range_m=z_range, image_rows=image_rows))
     return Blocks(grid=grid, kept=kept, dropped=dropped, num_far_keypoints=num_far)
 
 
-def _grid(
+def _occupied_cells(
     points: NDArray[np.float64], centers: NDArray[np.float64], options: ClusteringOptions
-) -> tuple[NDArray[np.bool_], GroundGrid]:
-    """The keypoints in the robust range, and the grid over them.
+) -> tuple[GroundGrid, NDArray[np.int64], NDArray[np.int64], int]:
+    """The grid over the keypoints in the robust range, its (C, 2) cells with keypoints, their counts, and the rest.
 
     The range is the cells that a block in reach of some camera could have, so that far outliers neither decide where
     the grid begins nor how large it is.
@@ -115,18 +113,39 @@ def _grid(
     size = np.array(options.block_size_m)
     low = np.floor((centers[:, :2].min(axis=0) - options.max_camera_distance_m) / size) - 1
     high = np.floor((centers[:, :2].max(axis=0) + options.max_camera_distance_m) / size) + 1
-    cells = ground_cells(points, (0.0, 0.0), options.block_size_m)
-    near: NDArray[np.bool_] = np.all((cells >= low) & (cells <= high), axis=1)
-    origin = (cells[near].min(axis=0) if near.any() else low) * size
-    return near, GroundGrid(
+    num_near, first = 0, np.full(2, np.inf)
+    for near in _near(points, low, high, options):
+        num_near += len(near)
+        first = np.minimum(first, ground_cells(near, (0.0, 0.0), options.block_size_m).min(axis=0, initial=np.inf))
+    origin = (first if num_near else low) * size
+    grid = GroundGrid(
         origin_m=(float(origin[0]), float(origin[1])),
         block_size_m=options.block_size_m,
         overlap_m=options.overlap_m,
         sample_spacing_m=options.sample_spacing_m,
     )
+    runs = [_runs(grid.cells_of(near)) for near in _near(points, low, high, options)]
+    run_cells = np.concatenate([cells for cells, _ in runs] or [np.empty((0, 2), dtype=np.int64)])
+    cells, slot = np.unique(run_cells, axis=0, return_inverse=True)
+    counts = np.zeros(len(cells), dtype=np.int64)
+    np.add.at(counts, slot.reshape(-1), np.concatenate([lengths for _, lengths in runs] or [counts]))
+    return grid, cells, counts, len(points) - num_near
 
 
-def _count_cells(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """i, j and number of rows of each distinct cell, in ascending order."""
-    distinct, counts = np.unique(cells, axis=0, return_counts=True)
-    return distinct[:, 0], distinct[:, 1], counts
+def _runs(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The cells (n, 2) without repetitions in a row, and how long each run was."""
+    starts = np.flatnonzero(
+        np.append(True, (cells[1:, 0] != cells[:-1, 0]) | (cells[1:, 1] != cells[:-1, 1]))[: len(cells)]
+    )
+    return cells[starts], np.diff(np.append(starts, len(cells)))
+
+
+def _near(
+    points: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], options: ClusteringOptions
+) -> Iterator[NDArray[np.float64]]:
+    """The points in a range of cells, piece by piece."""
+    for start in range(0, len(points), _PIECE_POINTS):
+        piece = points[start : start + _PIECE_POINTS]
+        cells = ground_cells(piece, (0.0, 0.0), options.block_size_m)
+        i, j = cells.T
+        yield piece[(i >= low[0]) & (i <= high[0]) & (j >= low[1]) & (j <= high[1])]

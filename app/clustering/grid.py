@@ -41,29 +41,3 @@ class GroundGrid:
             z_range_m=z_range_m,
             padding_m=self.overlap_m,
         )
-
-
-class CellIndex:
-    """Finds the rows whose cells lie in a rectangle of cells. Sparse: its size follows the rows, not the extent."""
-
-    def __init__(self, cells: NDArray[np.int64]) -> None:
-        """Index (n, 2) cells."""
-        self._order = np.lexsort((cells[:, 1], cells[:, 0]))
-        self._columns = cells[self._order, 1]
-        self._lines, starts = np.unique(cells[self._order, 0], return_index=True)
-        self._starts = np.append(starts, len(cells))
-
-    def rows_between(self, low: Cell, high: Cell) -> NDArray[np.int64]:
-        """Ascending rows whose cells are at least ``low`` and at most ``high`` in both directions."""
-        found = []
-        first, last = np.searchsorted(self._lines, [low[0], high[0] + 1])
-        for line in range(first, last):
-            start, end = self._starts[line], self._starts[line + 1]
-            columns = self._columns[start:end]
-            inside = np.searchsorted(columns, [low[1], high[1] + 1])
-            found.append(self._order[start + inside[0] : start + inside[1]])
-        return np.sort(np.concatenate(found)) if found else np.empty(0, dtype=np.int64)
-
-    def rows_around(self, cell: Cell, reach: Cell) -> NDArray[np.int64]:
-        """Ascending rows at most ``reach`` cells away from a cell in each direction."""
-        return self.rows_between((cell[0] - reach[0], cell[1] - reach[1]), (cell[0] + reach[0], cell[1] + reach[1]))

@@ -8,14 +8,20 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from app.clustering.clusters import Clustering, cluster_views
+import numpy as np
+
+from app.clustering.association import Blocks
+from app.clustering.clusters import Clustering, cluster_name, find_blocks, name_clusters
 from app.clustering.map_picture import write_map
 from app.clustering.options import ClusteringOptions
 from app.errors import InputError
 from app.scene.posed_scene import PosedScene
-from app.scene.read_model import read_posed_scene
+from app.scene.read_model import open_scene, store_scene
 
 logger = logging.getLogger(__name__)
+
+SCENE_FOLDER = "scene"
+"""The model as arrays, beside the clusters."""
 
 
 def cluster(model_dir: Path, output_dir: Path, *, options: ClusteringOptions) -> Clustering:
@@ -23,34 +29,37 @@ def cluster(model_dir: Path, output_dir: Path, *, options: ClusteringOptions) ->
 
     Args:
         model_dir: COLMAP model with z up.
-        output_dir: Gets ``clusters.jsonl``, ``report.json`` and ``map.png``.
+        output_dir: Gets ``clusters.jsonl``, ``report.json``, ``map.png``, and the model as ``scene/`` for later stages.
         options: Lengths in units of the model.
 
     Raises:
         InputError: the model can't be read, or no block has enough keypoints and an image near by.
     """
-    scene = read_posed_scene(model_dir)
-    clustering = cluster_views(scene, options)
-    if not clustering.clusters:
+    store_scene(model_dir, output_dir / SCENE_FOLDER)
+    scene = open_scene(output_dir / SCENE_FOLDER)
+    blocks = find_blocks(scene, options)
+    if not blocks.kept:
         raise InputError(
             f"no block in {model_dir} has {options.min_keypoints_per_block} keypoints and an image that sees it from"
             f" {options.max_camera_distance_m:g} m away; check the model's scale and that z is up,"
             " or raise clustering.max_camera_distance_m"
         )
-    report = _report(scene, clustering)
+    clustering = name_clusters(scene, blocks, options)
+    report = _report(scene, blocks, options)
     _log(report)
-    output_dir.mkdir(parents=True, exist_ok=True)
     write_map(scene, clustering, output_dir / "map.png")
     (output_dir / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     clustering.write(output_dir)
     return clustering
 
 
-def _report(scene: PosedScene, clustering: Clustering) -> dict[str, Any]:
+def _report(scene: PosedScene, blocks: Blocks, options: ClusteringOptions) -> dict[str, Any]:
     """The rows of [O]'s table 1 for clustering, and everything that is in no cluster or in a small one."""
-    num_images, num_clusters = len(scene.image_names), len(clustering.clusters)
-    num_associated = sum(len(cluster.image_names) for cluster in clustering.clusters)
-    associated = {name for cluster in clustering.clusters for name in cluster.image_names}
+    num_images, num_clusters = len(scene.image_names), len(blocks.kept)
+    num_associated = sum(len(block.image_rows) for block in blocks.kept)
+    in_no_cluster = np.ones(num_images, dtype=np.bool_)
+    for block in blocks.kept:
+        in_no_cluster[block.image_rows] = False
     return {
         "num_images": num_images,
         "num_keypoints": len(scene.point_ids),
@@ -58,12 +67,16 @@ def _report(scene: PosedScene, clustering: Clustering) -> dict[str, Any]:
         "num_images_after_clustering": num_associated,
         "clusters_per_image": num_associated / num_images,
         "images_per_cluster": num_associated / num_clusters,
-        "num_far_keypoints": clustering.num_far_keypoints,
-        "small_clusters": {c.name: len(c.image_names) for c in clustering.clusters if c.is_small},
-        "images_in_no_cluster": [name for name in scene.image_names if name not in associated],
+        "num_far_keypoints": blocks.num_far_keypoints,
+        "small_clusters": {
+            cluster_name(block): len(block.image_rows)
+            for block in blocks.kept
+            if len(block.image_rows) < options.min_cameras_per_cluster
+        },
+        "images_in_no_cluster": scene.image_names.take(np.flatnonzero(in_no_cluster)),
         "dropped_blocks": [
             {"cell": block.cell, "num_keypoints": block.num_keypoints, "reason": block.reason}
-            for block in clustering.dropped
+            for block in blocks.dropped
         ],
     }
 

@@ -12,6 +12,8 @@ POINT_HEADER_BYTES = 43
 """points3D.bin: u64 point ID, 3 f64 position, 3 u8 colour, f64 error; then u64 track length."""
 POINT2D_BYTES = 24
 TRACK_ELEMENT_BYTES = 8
+_MAX_COUNT = np.uint64(1 << 40)
+"""Of what a record says it holds: more is a damaged file, and would overflow."""
 
 
 @njit(cache=True)
@@ -24,61 +26,54 @@ def _u64(data: NDArray[np.uint8], start: int) -> np.uint64:
 
 @njit(cache=True)
 def index_images(data: NDArray[np.uint8], count: int) -> NDArray[np.int64]:
-    """Find the records of an images.bin without reading the 2D points in them.
+    """Find the records of an images.bin whose headers and names lie in a piece of it, without reading their 2D points.
 
     Args:
-        data: (bytes,) the file.
-        count: Records that its first 8 bytes promise.
+        data: (bytes,) a piece of the file that begins with a record.
+        count: Records to find at most.
 
     Returns:
-        (count + 1, 2) start of each record and end of its name (the NUL); the last row's first entry is where the last
-        record ends. Empty when the file is cut off.
+        (n + 1, 2) start of each record and end of its name (the NUL); the last row holds twice where the next record
+        begins, which may lie behind the piece.
     """
     index = np.empty((count + 1, 2), np.int64)
-    position = 8
-    for record in range(count):
-        index[record, 0] = position
-        position += IMAGE_HEADER_BYTES
-        while position < len(data) and data[position] != 0:
-            position += 1
-        if position + 9 > len(data):
-            return np.empty((0, 2), np.int64)
-        index[record, 1] = position
-        num_points2D = _u64(data, position + 1)
-        position += 9
-        if num_points2D > np.uint64((len(data) - position) // POINT2D_BYTES):
-            return np.empty((0, 2), np.int64)
-        position += int(num_points2D) * POINT2D_BYTES
-    index[count, 0] = position
-    index[count, 1] = position
-    return index
+    position, found = 0, 0
+    while found < count and position < len(data):
+        end = position + IMAGE_HEADER_BYTES
+        while end < len(data) and data[end] != 0:
+            end += 1
+        if end + 9 > len(data):
+            break
+        index[found, 0], index[found, 1] = position, end
+        found += 1
+        position = end + 9 + int(min(_u64(data, end + 1), _MAX_COUNT)) * POINT2D_BYTES
+    index[found] = position
+    return index[: found + 1]
 
 
 @njit(cache=True)
 def index_points(data: NDArray[np.uint8], count: int) -> NDArray[np.int64]:
-    """Find the records of a points3D.bin.
+    """Find the records of a points3D.bin that lie wholly in a piece of it.
 
     Args:
-        data: (bytes,) the file.
-        count: Records that its first 8 bytes promise.
+        data: (bytes,) a piece of the file that begins with a record.
+        count: Records to find at most.
 
     Returns:
-        (count + 1,) start of each record, and the end of the last one. Empty when the file is cut off.
+        (n + 1,) start of each record, and where the next one begins.
     """
     index = np.empty(count + 1, np.int64)
-    position = 8
-    for record in range(count):
-        index[record] = position
-        position += POINT_HEADER_BYTES
-        if position + 8 > len(data):
-            return np.empty(0, np.int64)
-        length = _u64(data, position)
-        position += 8
-        if length > np.uint64((len(data) - position) // TRACK_ELEMENT_BYTES):
-            return np.empty(0, np.int64)
-        position += int(length) * TRACK_ELEMENT_BYTES
-    index[count] = position
-    return index
+    position, found = 0, 0
+    while found < count and position + POINT_HEADER_BYTES + 8 <= len(data):
+        length = _u64(data, position + POINT_HEADER_BYTES)
+        end = position + POINT_HEADER_BYTES + 8 + int(min(length, _MAX_COUNT)) * TRACK_ELEMENT_BYTES
+        if end > len(data):
+            break
+        index[found] = position
+        found += 1
+        position = end
+    index[found] = position
+    return index[: found + 1]
 
 
 @njit(cache=True)
@@ -92,30 +87,116 @@ def gather_bytes(data: NDArray[np.uint8], starts: NDArray[np.int64], width: int)
 
 
 @njit(cache=True)
-def gather_track_image_ids(
-    data: NDArray[np.uint8], index: NDArray[np.int64], offsets: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Image IDs of all tracks of a points3D.bin.
+def gather_names(data: NDArray[np.uint8], starts: NDArray[np.int64], ends: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """(len(starts), longest) the bytes from each start to its end, filled up with NULs."""
+    out = np.zeros((len(starts), max(1, (ends - starts).max())), np.uint8)
+    for row in range(len(starts)):
+        for byte in range(ends[row] - starts[row]):
+            out[row, byte] = data[starts[row] + byte]
+    return out
+
+
+@njit(cache=True)
+def _row_of(
+    image_id: int, row_of_id: NDArray[np.int32], ascending_ids: NDArray[np.int64], rows: NDArray[np.int32]
+) -> int:
+    if image_id < len(row_of_id):
+        return int(row_of_id[image_id])
+    slot = np.searchsorted(ascending_ids, image_id)
+    if slot < len(ascending_ids) and ascending_ids[slot] == image_id:
+        return int(rows[slot])
+    return -1
+
+
+@njit(cache=True)
+def decode_tracks(
+    data: NDArray[np.uint8],
+    index: NDArray[np.int64],
+    positions: NDArray[np.float64],
+    centers: NDArray[np.float64],
+    row_of_id: NDArray[np.int32],
+    ascending_ids: NDArray[np.int64],
+    rows: NDArray[np.int32],
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+    """Tracks of records of a points3D.bin, each image once, and where the points face.
 
     Args:
-        data: (bytes,) the file.
-        index: (P + 1,) from :func:`index_points`.
-        offsets: (P + 1,) where each point's track starts in the output.
+        data: (bytes,) a piece of the file.
+        index: (n + 1,) from :func:`index_points`.
+        positions: (n, 3) of the points.
+        centers: (N, 3) projection centres of the images.
+        row_of_id: (L,) row of the images whose IDs are below L; -1 where there is none.
+        ascending_ids: (N,) all image IDs.
+        rows: (N,) their rows.
 
     Returns:
-        (T,) image IDs.
+        (n + 1,) where each track begins in the next array, (T,) rows of images, ascending within a track, and (n, 3)
+        unit vectors along the mean direction to those images; zero where there is none.
     """
-    out = np.empty(offsets[-1], np.int64)
-    for point in range(len(index) - 1):
-        position = index[point] + POINT_HEADER_BYTES + 8
-        for element in range(offsets[point], offsets[point + 1]):
-            out[element] = (
+    num_points = len(index) - 1
+    offsets = np.zeros(num_points + 1, np.int64)
+    images = np.empty((index[-1] - index[0]) // TRACK_ELEMENT_BYTES, np.int32)
+    normals = np.zeros((num_points, 3), np.float32)
+    direction, mean = np.empty(3), np.empty(3)
+    end = 0
+    for point in range(num_points):
+        begin = end
+        for position in range(index[point] + POINT_HEADER_BYTES + 8, index[point + 1], TRACK_ELEMENT_BYTES):
+            image_id = (
                 np.int64(data[position])
                 | np.int64(data[position + 1]) << 8
                 | np.int64(data[position + 2]) << 16
                 | np.int64(data[position + 3]) << 24
             )
-            position += TRACK_ELEMENT_BYTES
+            row = _row_of(int(image_id), row_of_id, ascending_ids, rows)
+            if row >= 0:
+                images[end] = row
+                end += 1
+        images[begin:end].sort()
+        distinct = begin
+        for element in range(begin, end):
+            if element == begin or images[element] != images[distinct - 1]:
+                images[distinct] = images[element]
+                distinct += 1
+        end = distinct
+        offsets[point + 1] = end
+
+        mean[:] = 0.0
+        for element in range(begin, end):
+            square = 0.0
+            for axis in range(3):
+                direction[axis] = centers[images[element], axis] - positions[point, axis]
+                square += direction[axis] ** 2
+            if square > 0.0:
+                for axis in range(3):
+                    mean[axis] += direction[axis] / np.sqrt(square)
+        length = np.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2)
+        if length > 0.0:
+            for axis in range(3):
+                normals[point, axis] = mean[axis] / length
+    return offsets, images[:end], normals
+
+
+@njit(cache=True)
+def gather_tracks(
+    offsets: NDArray[np.int64], images: NDArray[np.int32], points: NDArray[np.int64]
+) -> NDArray[np.int32]:
+    """(T,) the tracks of some points, one after another.
+
+    Args:
+        offsets: (P + 1,) where each point's track begins in ``images``.
+        images: Rows of images.
+        points: Rows of points.
+    """
+    total = 0
+    for point in points:
+        total += offsets[point + 1] - offsets[point]
+    out = np.empty(total, np.int32)
+    end = 0
+    for point in points:
+        for element in range(offsets[point], offsets[point + 1]):
+            out[end] = images[element]
+            end += 1
     return out
 
 

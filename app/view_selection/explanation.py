@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from app.view_selection.quality import ViewQuality
 from app.view_selection.reduction import count_views
 from app.view_selection.visibility import pack_rows, unpack_rows
 
@@ -124,8 +125,7 @@ def explain_selection(
     n_vis: int,
     n_match: int,
     min_views: int,
-    quality: NDArray[np.float64] | None = None,
-    viewpoint: NDArray[np.int64] | None = None,
+    worth: ViewQuality | None = None,
 ) -> Explanation:
     """Find what keeps each view of a feasible selection.
 
@@ -139,8 +139,7 @@ def explain_selection(
         n_vis: N_vis.
         n_match: N_match.
         min_views: N_min.
-        quality: (N_c,) where selections are compared by it.
-        viewpoint: (N_c,) number of each view's viewpoint; only the best selected view of each counts.
+        worth: Where selections are compared by quality.
     """
     views = np.flatnonzero(selected)
     packed_selected, packed_usable = pack_rows(np.stack([selected, usable]))
@@ -161,7 +160,7 @@ def explain_selection(
         critical_points=tuple(seen.sum(axis=0).tolist()),
         held_views=tuple(tuple(np.flatnonzero(row).tolist()) for row in held),
         fills_min_views=len(views) <= min_views,
-        added_quality=_added_quality(views, quality, viewpoint),
+        added_quality=(0.0,) * len(views) if worth is None else _added_quality(views, worth),
     )
 
 
@@ -170,15 +169,12 @@ def _coverage(covered: NDArray[np.bool_]) -> Coverage:
     return Coverage(total=covered.shape[1], before=before, after=after)
 
 
-def _added_quality(
-    views: NDArray[np.int64], quality: NDArray[np.float64] | None, viewpoint: NDArray[np.int64] | None
-) -> tuple[float, ...]:
+def _added_quality(views: NDArray[np.int64], worth: ViewQuality) -> tuple[float, ...]:
     """What the total over viewpoints of the best selected view's quality loses without each view."""
-    if quality is None or viewpoint is None:
-        return (0.0,) * len(views)
-    best_first = np.lexsort((-quality[views], viewpoint[views]))
-    ordered = quality[views][best_first]
-    changes = np.diff(viewpoint[views][best_first], prepend=-1, append=-1) != 0
+    quality, viewpoint = worth.quality[views], worth.viewpoint[views]
+    best_first = np.lexsort((-quality, viewpoint))
+    ordered = quality[best_first]
+    changes = np.diff(viewpoint[best_first], prepend=-1, append=-1) != 0
     is_best, has_second = changes[:-1], ~changes[1:]
     added = np.empty(len(views))
     added[best_first] = np.where(is_best, ordered - np.where(has_second, np.append(ordered[1:], 0.0), 0.0), 0.0)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from ortools.linear_solver.python import model_builder as mip
+from ortools.linear_solver.python import model_builder_helper as mip
 
+from app.view_selection.quality import ViewQuality
 from app.view_selection.reduction import CoveringRows
 from app.view_selection.visibility import unpack_rows
 
@@ -32,11 +34,18 @@ class ViewProgram:
     min_views: int
     """N_min; at most the number of usable views."""
 
+    @cached_property
+    def views_of_rows(self) -> NDArray[np.bool_]:
+        """(R, N_c) the covering rows, unpacked."""
+        return unpack_rows(self.rows.bits, len(self.usable))
+
     def missing(self, selected: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """How many views each covering row lacks (R,), and how many matches each selected view lacks (N_c,)."""
-        covered = unpack_rows(self.rows.bits, len(selected)) @ selected.astype(np.int64)
-        matched = self.matches @ selected.astype(np.int64)
-        return np.maximum(self.rows.bounds - covered, 0), np.where(selected, np.maximum(self.n_match - matched, 0), 0)
+        covered = self.views_of_rows[:, selected].sum(axis=1)
+        matched = self.matches[selected][:, selected].sum(axis=1)
+        unmatched = np.zeros(len(selected), dtype=np.int64)
+        unmatched[selected] = np.maximum(self.n_match - matched, 0)
+        return np.maximum(self.rows.bounds - covered, 0), unmatched
 
     def is_met_by(self, selected: NDArray[np.bool_]) -> bool:
         """Whether a selection meets every constraint."""
@@ -69,7 +78,6 @@ def greedy_selection(program: ViewProgram, preference: NDArray[np.float64]) -> N
     Returns:
         (N_c,)
     """
-    views_of_row = unpack_rows(program.rows.bits, len(program.usable))
     order = np.lexsort((np.arange(len(preference)), -preference))
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
@@ -77,7 +85,7 @@ def greedy_selection(program: ViewProgram, preference: NDArray[np.float64]) -> N
     while True:
         uncovered, unmatched = program.missing(selected)
         if uncovered.any():
-            gain = views_of_row[uncovered > 0].sum(axis=0)
+            gain = program.views_of_rows[uncovered > 0].sum(axis=0)
         elif unmatched.any():
             gain = program.matches[unmatched > 0].sum(axis=0)
         elif selected.sum() < program.min_views:
@@ -100,7 +108,7 @@ def smallest_selection(program: ViewProgram, preference: NDArray[np.float64], ma
     selected = greedy_selection(program, preference)
     bound = max(program.min_views, int(program.fixed.sum()))
     if selected.sum() > bound:
-        found, objective_bound = _solve(program, _minimize_size, max_nodes)
+        found, objective_bound = _solve(_size_model(program), program, max_nodes)
         bound = max(bound, int(np.ceil(objective_bound - _TOLERANCE)))
         if found is not None and found.sum() < selected.sum():
             selected = found
@@ -110,8 +118,7 @@ def smallest_selection(program: ViewProgram, preference: NDArray[np.float64], ma
 def best_selection(
     program: ViewProgram,
     smallest: Solution,
-    quality: NDArray[np.float64],
-    viewpoint: NDArray[np.int64],
+    worth: ViewQuality,
     max_nodes: int,
 ) -> Solution:
     """Among the feasible selections of the smallest size, the one with the best total quality.
@@ -122,20 +129,14 @@ def best_selection(
     Args:
         program: What to meet.
         smallest: A selection of the size wanted.
-        quality: (N_c,) at least 0.
-        viewpoint: (N_c,) number of each view's viewpoint.
+        worth: Quality and viewpoint of each view.
         max_nodes: Limit of the solver.
     """
     size = int(smallest.selected.sum())
-
-    def maximize_quality(model: mip.Model, variables: list[mip.Variable]) -> None:
-        model.add_linear_constraint(mip.LinearExpr.sum(variables), size, size)
-        model.maximize(mip.LinearExpr.weighted_sum(_counted(model, variables, program, viewpoint), quality.tolist()))
-
-    found, objective_bound = _solve(program, maximize_quality, max_nodes)
+    found, objective_bound = _solve(_quality_model(program, worth, size), program, max_nodes)
     candidates = [smallest.selected] if found is None else [found, smallest.selected]
-    selected = max(candidates, key=lambda candidate: total_quality(candidate, quality, viewpoint))
-    total = total_quality(selected, quality, viewpoint)
+    selected = max(candidates, key=lambda candidate: total_quality(candidate, worth))
+    total = total_quality(selected, worth)
     proven = objective_bound <= total * (1 + _TOLERANCE)
     return Solution(
         selected=selected,
@@ -145,77 +146,106 @@ def best_selection(
     )
 
 
-def total_quality(selected: NDArray[np.bool_], quality: NDArray[np.float64], viewpoint: NDArray[np.int64]) -> float:
+def total_quality(selected: NDArray[np.bool_], worth: ViewQuality) -> float:
     """Sum over viewpoints of the best selected view's quality."""
-    best = np.zeros(int(viewpoint.max(initial=-1)) + 1)
-    np.maximum.at(best, viewpoint[selected], quality[selected])
+    best = np.zeros(int(worth.viewpoint.max(initial=-1)) + 1)
+    np.maximum.at(best, worth.viewpoint[selected], worth.quality[selected])
     return float(best.sum())
 
 
-def _minimize_size(model: mip.Model, variables: list[mip.Variable]) -> None:
-    model.minimize(mip.LinearExpr.sum(variables))
+class _Model:
+    """A mixed-integer program that grows by constraints; in arrays, as OR-Tools' Python objects cost more than SCIP."""
+
+    def __init__(self, lower: NDArray[np.float64], upper: NDArray[np.float64], num_integers: int) -> None:
+        """Variables between bounds; the first ``num_integers`` are whole."""
+        self._helper = mip.ModelBuilderHelper()
+        columns: tuple[Any, Any, Any] = (lower, upper, np.arange(len(lower)) < num_integers)
+        self._helper.add_var_array_with_bounds(*columns, "x")
+        self._variables = [mip.Variable(self._helper, index) for index in range(len(lower))]
+
+    def constrain(
+        self, variables: NDArray[np.integer], coefficients: NDArray[np.float64], lower: float, upper: float = np.inf
+    ) -> None:
+        """Bound a linear expression."""
+        row = self._helper.add_linear_constraint()
+        self._helper.add_terms_to_constraint(
+            row, [self._variables[index] for index in variables.tolist()], coefficients.tolist()
+        )
+        self._helper.set_constraint_lower_bound(row, lower)
+        self._helper.set_constraint_upper_bound(row, upper)
+
+    def optimize(self, coefficients: NDArray[np.float64], *, maximize: bool) -> None:
+        """Set the objective."""
+        self._helper.set_maximize(maximize)
+        self._helper.set_objective_coefficients(list(range(len(coefficients))), coefficients.tolist())
+
+    def solve(self, max_nodes: int) -> tuple[NDArray[np.float64] | None, float]:
+        """Values of the best solution found, if any, and the bound on the objective.
+
+        SCIP's limit counts nodes, so that the same model gives the same result on every machine. On a simulated drive
+        with 30 to 500 views a cluster, it proves the best quality in about 50 ms without presolving and twice that
+        with; CP-SAT finds no proof in 3 s, for the linear relaxation is nearly whole.
+        """
+        solver = mip.ModelSolverHelper("SCIP")
+        solver.set_solver_specific_parameters(f"limits/nodes = {max_nodes}\npresolving/maxrounds = 0")
+        solver.solve(self._helper)
+        bound = float(solver.best_objective_bound())
+        if solver.status() not in (mip.SolveStatus.OPTIMAL, mip.SolveStatus.FEASIBLE):
+            return None, bound
+        return np.asarray(solver.variable_values()), bound
 
 
-def _counted(
-    model: mip.Model, variables: list[mip.Variable], program: ViewProgram, viewpoint: NDArray[np.int64]
-) -> list[mip.Variable]:
-    """Per view, whether it counts: only if selected, and one of those at its viewpoint."""
-    counted = list(variables)
-    for number in np.unique(viewpoint[program.usable]):
-        views = np.flatnonzero((viewpoint == number) & program.usable).tolist()
-        if len(views) < 2:
-            continue
-        for view in views:
-            counted[view] = model.new_num_var(0.0, 1.0, f"counts_{view}")
-            model.add(counted[view] <= variables[view])
-        model.add_linear_constraint(mip.LinearExpr.sum([counted[view] for view in views]), 0.0, 1.0)
-    return counted
+def _size_model(program: ViewProgram) -> _Model:
+    model = _Model(program.fixed.astype(np.float64), program.usable.astype(np.float64), len(program.usable))
+    views = np.flatnonzero(program.usable)
+    model.constrain(views, np.ones(len(views)), program.min_views)
+    model.optimize(np.ones(len(program.usable)), maximize=False)
+    return model
 
 
-def _solve(
-    program: ViewProgram, set_objective: Callable[[mip.Model, list[mip.Variable]], None], max_nodes: int
-) -> tuple[NDArray[np.bool_] | None, float]:
+def _quality_model(program: ViewProgram, worth: ViewQuality, size: int) -> _Model:
+    """A variable per view, whether it is selected, and one per viewpoint and view that says whether its quality counts:
+    only if the view is selected, and one at each viewpoint."""
+    num_views, viewpoint = len(program.usable), worth.viewpoint
+    views = np.flatnonzero(program.usable)
+    alone = np.bincount(viewpoint[views], minlength=int(viewpoint.max(initial=-1)) + 1)[viewpoint] < 2
+    shared = views[~alone[views]]
+    lower = np.concatenate([program.fixed.astype(np.float64), np.zeros(len(shared))])
+    upper = np.concatenate([program.usable.astype(np.float64), np.ones(len(shared))])
+    model = _Model(lower, upper, num_views)
+    counts = np.arange(num_views)
+    counts[shared] = num_views + np.arange(len(shared))
+    for view in shared:
+        model.constrain(np.array([view, counts[view]]), np.array([1.0, -1.0]), 0.0)
+    for number in np.unique(viewpoint[shared]):
+        group = counts[shared[viewpoint[shared] == number]]
+        model.constrain(group, np.ones(len(group)), 0.0, 1.0)
+    model.constrain(views, np.ones(len(views)), size, size)
+    objective = np.zeros(len(lower))
+    objective[counts[views]] = worth.quality[views]
+    model.optimize(objective, maximize=True)
+    return model
+
+
+def _solve(model: _Model, program: ViewProgram, max_nodes: int) -> tuple[NDArray[np.bool_] | None, float]:
     """The best selection that the solver finds, if any, and its bound on the objective.
 
-    Matching constraints are many, dense and seldom active, so a view's constraint joins the model once a solution
-    without it violates it; the result is the same.
-
-    SCIP's limit counts nodes, so that the same model gives the same result on every machine. On a simulated drive with
-    30 to 500 views a cluster, it proves the best quality in about 50 ms without presolving and twice that with; CP-SAT
-    finds no proof in 3 s, for the linear relaxation is nearly whole.
+    Constraints are many and few of them active, so each joins the model once a solution without it violates it; the
+    result is the same.
     """
-    matched = np.zeros(len(program.usable), dtype=np.bool_)
+    seeing, usable = program.views_of_rows, program.usable
     while True:
-        model, variables = _model(program, matched)
-        set_objective(model, variables)
-        solver = mip.Solver("SCIP")
-        solver.set_solver_specific_parameters(f"limits/nodes = {max_nodes}\npresolving/maxrounds = 0")
-        status = solver.solve(model)
-        bound = float(solver.best_objective_bound)
-        if status not in (mip.SolveStatus.OPTIMAL, mip.SolveStatus.FEASIBLE):
+        values, bound = model.solve(max_nodes)
+        if values is None:
             return None, bound
-        selected = np.array([solver.value(variable) > 0.5 for variable in variables], dtype=np.bool_)
-        violated = (program.missing(selected)[1] > 0) & ~matched
-        if not violated.any():
+        selected = values[: len(usable)] > 0.5
+        uncovered, unmatched = program.missing(selected)
+        if not uncovered.any() and not unmatched.any():
             return selected if program.is_met_by(selected) else None, bound
-        matched |= violated
-
-
-def _model(program: ViewProgram, matched: NDArray[np.bool_]) -> tuple[mip.Model, list[mip.Variable]]:
-    """The program's constraints, with the matching of the views in ``matched`` only, and no objective."""
-    num_views = len(program.usable)
-    model = mip.Model()  # type: ignore[no-untyped-call]
-    variables = [
-        model.new_int_var(float(program.fixed[view]), float(program.usable[view]), f"view_{view}")
-        for view in range(num_views)
-    ]
-    model.add_linear_constraint(mip.LinearExpr.sum(variables), program.min_views)
-    for row, bound in zip(unpack_rows(program.rows.bits, num_views), program.rows.bounds, strict=True):
-        seeing = mip.LinearExpr.sum([variables[view] for view in np.flatnonzero(row).tolist()])
-        model.add_linear_constraint(seeing, float(bound))
-    for view in np.flatnonzero(matched).tolist():
-        partners = np.flatnonzero(program.matches[view] & program.usable).tolist()
-        terms = [variables[partner] for partner in partners] + [variables[view]]
-        weights = [1.0] * len(partners) + [-float(program.n_match)]
-        model.add_linear_constraint(mip.LinearExpr.weighted_sum(terms, weights), 0.0)
-    return model, variables
+        for row in np.flatnonzero(uncovered):
+            views = np.flatnonzero(seeing[row])
+            model.constrain(views, np.ones(len(views)), float(program.rows.bounds[row]))
+        for view in np.flatnonzero(unmatched):
+            partners = np.flatnonzero(program.matches[view] & usable)
+            weights = np.append(np.ones(len(partners)), -float(program.n_match))
+            model.constrain(np.append(partners, view), weights, 0.0)

@@ -6,43 +6,143 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from app.scene.kernels import sees
-
 
 @njit(cache=True)
 def frustum_bits(
     points: NDArray[np.float64], image_from_world: NDArray[np.float64], sizes_px: NDArray[np.float64]
 ) -> NDArray[np.uint64]:
-    """Which images each point projects into.
+    """Which points each image shows: those that `sees` says, 64 at a time.
 
     Args:
-        points: (P, 3) in the world.
+        points: (3, P) in the world, so that the loop over points is vectorised.
         image_from_world: (N, 3, 4) K [R | t].
         sizes_px: (N, 2) width, height.
 
     Returns:
-        (P, ceil(N / 64)) bit ``i % 64`` of word ``i // 64`` stands for image i.
+        (N, ceil(P / 64)) bit ``p % 64`` of word ``p // 64`` stands for point p.
     """
-    num_images = len(image_from_world)
-    bits = np.zeros((len(points), (num_images + 63) // 64), np.uint64)
-    for image in range(num_images):
-        matrix, size_px = image_from_world[image], sizes_px[image]
-        word, shift = image // 64, np.uint64(image % 64)
-        for point in range(len(points)):
-            bits[point, word] |= np.uint64(sees(matrix, size_px, points[point])) << shift
+    num_points = points.shape[1]
+    bits = np.zeros((len(image_from_world), (num_points + 63) // 64), np.uint64)
+    seen = np.zeros(64, np.uint8)
+    for image in range(len(image_from_world)):
+        m = image_from_world[image]
+        width, height = sizes_px[image, 0], sizes_px[image, 1]
+        for word in range(bits.shape[1]):
+            first = 64 * word
+            count = min(64, num_points - first)
+            for k in range(count):
+                x, y, z = points[0, first + k], points[1, first + k], points[2, first + k]
+                depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+                u = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
+                v = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
+                inside = (depth > 0.0) & (u >= 0.0) & (u < width * depth) & (v >= 0.0) & (v < height * depth)
+                seen[k] = np.uint8(inside)
+            packed = np.uint64(0)
+            for k in range(count):
+                packed |= np.uint64(seen[k]) << np.uint64(k)
+            bits[image, word] = packed
     return bits
 
 
 @njit(cache=True)
 def transpose_bits(bits: NDArray[np.uint64], num_columns: int) -> NDArray[np.uint64]:
-    """(num_columns, ceil(rows / 64)) the transpose of a packed matrix (rows, words)."""
+    """(num_columns, ceil(rows / 64)) the transpose of a packed matrix (rows, words).
+
+    Blocks of 64 by 64 are transposed by swapping halves of halves: H. S. Warren, Hacker's Delight, section 7-3.
+    """
     out = np.zeros((num_columns, (len(bits) + 63) // 64), np.uint64)
-    for row in range(len(bits)):
-        word, bit = row // 64, np.uint64(1) << np.uint64(row % 64)
-        for column in range(num_columns):
-            if (bits[row, column // 64] >> np.uint64(column % 64)) & np.uint64(1):
-                out[column, word] |= bit
+    block = np.zeros(64, np.uint64)
+    for word in range(out.shape[1]):
+        num_rows = min(64, len(bits) - 64 * word)
+        for column_word in range((num_columns + 63) // 64):
+            block[:] = 0
+            for row in range(num_rows):
+                block[row] = bits[64 * word + row, column_word]
+            half, mask = 32, np.uint64(0x00000000FFFFFFFF)
+            while half:
+                shift = np.uint64(half)
+                for row in range(64):
+                    if not row & half:
+                        swapped = ((block[row] >> shift) ^ block[row + half]) & mask
+                        block[row + half] ^= swapped
+                        block[row] ^= swapped << shift
+                half >>= 1
+                mask ^= mask << np.uint64(half)
+            for row in range(min(64, num_columns - 64 * column_word)):
+                out[64 * column_word + row, word] = block[row]
     return out
+
+
+@njit(cache=True)
+def count_distinct(bits: NDArray[np.uint64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(D,) the first of each set of equal rows of a packed matrix (rows, words), and how many rows are like it."""
+    size = 16
+    while size < 2 * len(bits):
+        size *= 2
+    slots = np.full(size, -1, np.int64)
+    first, counts = np.empty(len(bits), np.int64), np.zeros(len(bits), np.int64)
+    num_distinct = 0
+    for row in range(len(bits)):
+        mixed = np.uint64(0)
+        for word in range(bits.shape[1]):
+            mixed = (mixed ^ bits[row, word]) * np.uint64(0x9E3779B97F4A7C15)
+            mixed ^= mixed >> np.uint64(32)
+        slot = np.int64(mixed & np.uint64(size - 1))
+        while slots[slot] >= 0 and np.any(bits[first[slots[slot]]] != bits[row]):
+            slot = (slot + 1) & (size - 1)
+        if slots[slot] < 0:
+            slots[slot] = num_distinct
+            first[num_distinct] = row
+            num_distinct += 1
+        counts[slots[slot]] += 1
+    return first[:num_distinct], counts[:num_distinct]
+
+
+@njit(cache=True)
+def resolution_on_surface(
+    by_point: NDArray[np.uint64],
+    points: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    centers: NDArray[np.float64],
+    focal_lengths_px: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """How well images show points, relative to the image that shows each best.
+
+    Args:
+        by_point: (n, words) images that see each point, packed.
+        points: (n, 3) in the world.
+        normals: (n, 3) unit vectors.
+        centers: (N, 3) projection centres.
+        focal_lengths_px: (N,)
+
+    Returns:
+        (N,) sum over the points that an image sees of ``f cos(theta) / d``, for focal length f, angle of incidence
+        theta and distance d, divided by the largest for the point; and the distances of all points seen.
+    """
+    num_images = len(centers)
+    total, resolution = np.zeros(num_images), np.empty(num_images)
+    distances = np.empty(len(points) * num_images)
+    num_seen = 0
+    for point in range(len(points)):
+        best = 0.0
+        for image in range(num_images):
+            resolution[image] = 0.0
+            if not (by_point[point, image // 64] >> np.uint64(image % 64)) & np.uint64(1):
+                continue
+            square, along = 0.0, 0.0
+            for axis in range(3):
+                towards = centers[image, axis] - points[point, axis]
+                square += towards * towards
+                along += towards * normals[point, axis]
+            distances[num_seen] = np.sqrt(square)
+            num_seen += 1
+            if along > 0.0:
+                resolution[image] = focal_lengths_px[image] * along / square
+                best = max(best, resolution[image])
+        if best > 0.0:
+            for image in range(num_images):
+                total[image] += resolution[image] / best
+    return total, distances[:num_seen]
 
 
 @njit(cache=True)
@@ -84,10 +184,13 @@ def undominated(bits: NDArray[np.uint64], bounds: NDArray[np.int64]) -> NDArray[
     Returns:
         (R,)
     """
-    keep = np.ones(len(bits), np.bool_)
+    keep = np.zeros(len(bits), np.bool_)
+    kept = np.empty(len(bits), np.int64)
+    num_kept = 0
     for row in range(len(bits)):
-        for other in range(row):
-            if not keep[other] or bounds[other] < bounds[row]:
+        implied = False
+        for other in kept[:num_kept]:
+            if bounds[other] < bounds[row]:
                 continue
             implied = True
             for word in range(bits.shape[1]):
@@ -95,6 +198,9 @@ def undominated(bits: NDArray[np.uint64], bounds: NDArray[np.int64]) -> NDArray[
                     implied = False
                     break
             if implied:
-                keep[row] = False
                 break
+        if not implied:
+            keep[row] = True
+            kept[num_kept] = row
+            num_kept += 1
     return keep

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.clustering.clusters import Cluster
-from app.clustering.grid import CellIndex, GroundGrid
 from app.clustering.samples import grid_points, sample_axes
 from app.errors import InputError
+from app.scene.point_index import PointIndex
 from app.scene.posed_scene import PosedScene
+from app.view_selection.options import Visibility
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,8 +34,10 @@ class ViewProblem:
     """(N_c, 3) unit vectors along the optical axes."""
     keypoints_in_world: NDArray[np.float64]
     """(K, 3) in the padded cells, in the order of their coordinates, so that no ID matters."""
+    keypoint_normals: NDArray[np.float64]
+    """(K, 3) unit vectors, where the surface faces at each keypoint; see `PosedScene`."""
     observations: NDArray[np.int64]
-    """(T, 2) keypoint and view, by track."""
+    """(T, 2) keypoint and view, by track; empty where nobody asks for it."""
     samples_in_world: NDArray[np.float64]
     """(S, 3)"""
 
@@ -42,33 +45,33 @@ class ViewProblem:
 class ProblemCutter:
     """Cuts the problems of a grid's clusters out of a scene; each costs the cluster's size, not the scene's."""
 
-    def __init__(self, scene: PosedScene, grid: GroundGrid) -> None:
+    def __init__(self, scene: PosedScene) -> None:
         """Index a scene."""
         self._scene = scene
-        self._row_of_image = {name: row for row, name in enumerate(scene.image_names)}
         self._image_from_world = scene.image_from_world
         self._sizes_px = scene.image_sizes_px
         self._centers = scene.centers_in_world
-        reach = 2.0**40 * min(grid.block_size_m)
-        self._point_rows = np.flatnonzero(np.all(np.abs(scene.points_in_world[:, :2] - grid.origin_m) < reach, axis=1))
-        self._points = CellIndex(grid.cells_of(scene.points_in_world[self._point_rows]))
+        self._points = PointIndex(scene.points_in_world)
 
-    def problem(self, cluster: Cluster) -> ViewProblem:
-        """Cut out one cluster.
+    def problem(self, cluster: Cluster, visibility: Visibility) -> ViewProblem:
+        """Cut out one cluster, with what a kind of visibility needs.
 
         Raises:
             InputError: the scene lacks one of its images.
         """
         scene = self._scene
-        try:
-            rows = np.array([self._row_of_image[name] for name in cluster.image_names], dtype=np.int64)
-        except KeyError as error:
+        rows = scene.image_names.rows_of(cluster.image_names)
+        if np.any(rows < 0):
+            name = cluster.image_names[int(np.argmax(rows < 0))]
             raise InputError(
-                f"image {error.args[0]!r} of cluster {cluster.name} is not in the model; run `cityrecon cluster` again"
-            ) from error
+                f"image {name!r} of cluster {cluster.name} is not in the model; run `cityrecon cluster` again"
+            )
         boxes = cluster.region().padded_boxes()
         boxes[:, :, 2] = cluster.z_range_m
-        point_rows = self._points_in(cluster, boxes)
+        point_rows = self._points_in(boxes)
+        observations = np.empty((0, 2), dtype=np.int64)
+        if visibility is Visibility.TRACKS:
+            observations = _observations(scene, rows, point_rows)
         spacing = cluster.grid.sample_spacing_m
         return ViewProblem(
             cluster=cluster.name,
@@ -79,20 +82,16 @@ class ProblemCutter:
             centers_in_world=self._centers[rows],
             directions_in_world=scene.cam_from_world[rows, 2, :3],
             keypoints_in_world=scene.points_in_world[point_rows],
-            observations=_observations(scene, rows, point_rows),
+            keypoint_normals=scene.point_normals[point_rows].astype(np.float64),
+            observations=observations,
             samples_in_world=np.concatenate([grid_points(sample_axes(box, spacing)) for box in boxes]),
         )
 
-    def _points_in(self, cluster: Cluster, boxes: NDArray[np.float64]) -> NDArray[np.int64]:
+    def _points_in(self, boxes: NDArray[np.float64]) -> NDArray[np.int64]:
         """Rows of the points in a cluster's padded cells, in the order of their coordinates."""
-        around = [self._points.rows_around(cell, (1, 1)) for cell in cluster.cells]
-        rows = self._point_rows[np.unique(np.concatenate(around))]
-        points = self._scene.points_in_world[rows]
-        inside = np.zeros(len(rows), dtype=np.bool_)
-        for low, high in boxes[:, :, :2]:
-            inside |= np.all((points[:, :2] >= low) & (points[:, :2] <= high), axis=1)
-        rows, points = rows[inside], points[inside]
-        return rows[np.lexsort(points.T[::-1])]
+        found = [self._points.rows_between(low, high) for low, high in boxes[:, :, :2]]
+        rows = found[0] if len(found) == 1 else np.unique(np.concatenate(found))
+        return rows[np.lexsort(self._scene.points_in_world[rows].T[::-1])]
 
 
 def _observations(scene: PosedScene, image_rows: NDArray[np.int64], point_rows: NDArray[np.int64]) -> NDArray[np.int64]:

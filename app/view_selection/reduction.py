@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from app.view_selection.kernels import undominated
+from app.view_selection.kernels import count_distinct, undominated
 
 
 def count_views(bits: NDArray[np.uint64]) -> NDArray[np.int64]:
@@ -48,7 +48,9 @@ def covering_rows(
     Returns:
         The distinct rows with a positive bound, and how many points have 0, 1, ... ``n_vis`` - 1 usable views.
     """
-    distinct, counts = _distinct_rows(visible & usable)
+    rows_of_points = visible & usable
+    first, counts = count_distinct(rows_of_points)
+    distinct = rows_of_points[first]
     sizes = count_views(distinct)
     num_relaxed = np.bincount(np.minimum(sizes, n_vis), weights=counts, minlength=n_vis + 1)[:n_vis]
     rows = CoveringRows(bits=distinct, bounds=np.minimum(sizes, n_vis))
@@ -79,12 +81,3 @@ def reduce_rows(rows: CoveringRows, fixed: NDArray[np.uint64]) -> CoveringRows:
     order = np.lexsort((*open_rows.bits.T, -open_rows.bounds, open_rows.sizes))
     ordered = open_rows[order]
     return ordered[undominated(ordered.bits, ordered.bounds)]
-
-
-def _distinct_rows(bits: NDArray[np.uint64]) -> tuple[NDArray[np.uint64], NDArray[np.int64]]:
-    """Distinct rows in a fixed order, and how often each occurs."""
-    ordered = bits[np.lexsort(bits.T)]
-    is_first = np.ones(len(ordered), dtype=np.bool_)
-    is_first[1:] = np.any(ordered[1:] != ordered[:-1], axis=1)
-    starts = np.flatnonzero(is_first)
-    return ordered[starts], np.diff(np.append(starts, len(ordered)))

@@ -15,7 +15,7 @@ from app.view_selection.explanation import Explanation, explain_selection
 from app.view_selection.ilp import Solution, ViewProgram, best_selection, smallest_selection
 from app.view_selection.options import SelectionMethod, SelectionOptions
 from app.view_selection.problem import ViewProblem
-from app.view_selection.quality import view_quality, viewpoints
+from app.view_selection.quality import view_quality
 from app.view_selection.reduction import CoveringRows, covering_rows, reduce_rows, required_views
 from app.view_selection.visibility import matching_views, pack_rows, unpack_rows, visible_points
 
@@ -73,25 +73,25 @@ def select_views(problem: ViewProblem, options: SelectionOptions) -> Selection:
     """
     num_views = len(problem.image_names)
     visible = visible_points(problem, options.visibility)
-    matches, num_seen = matching_views(visible, num_views, options.min_shared_points)
+    matches = matching_views(visible, options.min_shared_points)
     usable, n_match = _usable_views(matches, options.n_match)
-    rows, num_seen_by = covering_rows(visible, pack_rows(usable[None])[0], options.n_vis)
+    rows, num_seen_by = covering_rows(visible.by_point, pack_rows(usable[None])[0], options.n_vis)
     wanted = options.min_views(num_views)
     relaxed = _relaxations(num_seen_by, n_match, wanted, int(usable.sum()), options)
     min_views = min(wanted, int(usable.sum()))
 
-    forced = _forced_views(num_seen, usable, min_views, options)
+    forced = _forced_views(visible.num_seen, usable, min_views, options)
     program = _program(rows, matches, usable, n_match, min_views, forced)
-    quality = viewpoint = None
-    if options.method is SelectionMethod.OPTIMAL:
-        quality, viewpoint = view_quality(problem, visible), viewpoints(problem, visible)
-    preference = num_seen.astype(np.float64) if quality is None else quality
-    solution = smallest_selection(program, preference, options.max_solver_nodes)
-    if quality is not None and viewpoint is not None:
-        solution = best_selection(program, solution, quality, viewpoint, options.max_solver_nodes)
+    worth = None
+    if options.method is SelectionMethod.PAPER:
+        solution = smallest_selection(program, visible.num_seen.astype(np.float64), options.max_solver_nodes)
+    else:
+        worth = view_quality(problem, visible)
+        solution = smallest_selection(program, worth.quality, options.max_solver_nodes)
+        solution = best_selection(program, solution, worth, options.max_solver_nodes)
     explanation = explain_selection(
         selected=solution.selected,
-        visible=visible,
+        visible=visible.by_point,
         num_keypoints=len(problem.keypoints_in_world),
         usable=usable,
         forced=forced,
@@ -99,10 +99,9 @@ def select_views(problem: ViewProblem, options: SelectionOptions) -> Selection:
         n_vis=options.n_vis,
         n_match=n_match,
         min_views=min_views,
-        quality=quality,
-        viewpoint=viewpoint,
+        worth=worth,
     )
-    return _selection(problem, program, solution, relaxed, explanation, num_points=len(visible))
+    return _selection(problem, program, solution, relaxed, explanation, num_points=len(visible.by_point))
 
 
 def _usable_views(matches: NDArray[np.bool_], n_match: int) -> tuple[NDArray[np.bool_], int]:

@@ -7,28 +7,30 @@ import logging
 import multiprocessing
 import os
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from app.clustering.clusters import Clustering
+from app.clustering.stage import SCENE_FOLDER
 from app.executor import die_with_parent
-from app.scene.read_model import read_posed_scene
+from app.scene.read_model import open_scene
 from app.view_selection.explanation import ExplanationSums
 from app.view_selection.options import SelectionOptions
-from app.view_selection.problem import ProblemCutter, ViewProblem
+from app.view_selection.problem import ProblemCutter
 from app.view_selection.selection import Selection, select_views, write_selections
 
 logger = logging.getLogger(__name__)
 
-_MIN_CLUSTERS_PER_WORKER = 16
+_BATCH = 8
+"""Clusters that a worker process is given at a time."""
+_MIN_CLUSTERS_PER_WORKER = 64
 """A worker process takes about as long to start as it takes to solve this many clusters."""
 
 
 def select(
-    model_dir: Path,
     clusters_dir: Path,
     output_dir: Path,
     *,
@@ -39,21 +41,17 @@ def select(
     """Select views for every cluster, [O] section 4.
 
     Args:
-        model_dir: The COLMAP model that was clustered.
-        clusters_dir: With ``clusters.jsonl``.
+        clusters_dir: With ``clusters.jsonl`` and the clustered model.
         output_dir: Gets ``selection.jsonl`` and ``report.json``.
         options: The paper's parameters, and the method.
         num_workers: Processes; the result doesn't depend on it.
         progress: Called with (clusters done, clusters in all).
 
     Raises:
-        InputError: the model or the clusters can't be read, or don't belong together.
+        InputError: the clusters can't be read, or don't belong to the model beside them.
     """
-    clustering = Clustering.read(clusters_dir)
-    scene = read_posed_scene(model_dir)
-    cutter = ProblemCutter(scene, clustering.grid)
-    problems = (cutter.problem(cluster) for cluster in clustering.clusters)
-    num_clusters = len(clustering.clusters)
+    reader = _ClusterReader(clusters_dir)
+    num_images, num_clusters = len(reader.scene.image_names), len(reader.clusters)
     num_workers = max(1, min(num_workers, num_clusters // _MIN_CLUSTERS_PER_WORKER))
     totals = Counter[str]()
     explained = ExplanationSums()
@@ -61,7 +59,7 @@ def select(
     empty: list[str] = []
 
     def counted() -> Iterator[Selection]:
-        for done, selection in enumerate(_solved(problems, options, num_workers), start=1):
+        for done, selection in enumerate(_solved(reader, options, num_workers), start=1):
             totals["selected"] += len(selection.image_names)
             totals["relaxed"] += bool(selection.relaxed)
             explained.add(selection.explanation)
@@ -77,10 +75,10 @@ def select(
     write_selections(counted(), output_dir)
     report: dict[str, Any] = {
         "method": options.method,
-        "num_images": len(scene.image_names),
+        "num_images": num_images,
         "num_clusters": num_clusters,
         "num_images_after_selection": totals["selected"],
-        "clusters_per_image": totals["selected"] / len(scene.image_names),
+        "clusters_per_image": totals["selected"] / num_images,
         "images_per_cluster": totals["selected"] / num_clusters,
         "clusters_with_relaxed_constraints": totals["relaxed"],
         **explained.record(),
@@ -101,19 +99,57 @@ def select(
         logger.warning("cluster %s has no two views that match: it stays empty", name)
 
 
-def _solved(problems: Iterable[ViewProblem], options: SelectionOptions, num_workers: int) -> Iterator[Selection]:
-    """Selections in the order of the problems, with few of either in memory."""
+class _ClusterReader:
+    """The clusters of a folder and their problems; each process has one of its own."""
+
+    def __init__(self, clusters_dir: Path) -> None:
+        self.folder = clusters_dir
+        self.clusters = Clustering.read(clusters_dir).clusters
+        self.scene = open_scene(clusters_dir / SCENE_FOLDER)
+        self._cutter = ProblemCutter(self.scene)
+
+    def select(self, batch: range, options: SelectionOptions) -> list[Selection]:
+        return [
+            select_views(self._cutter.problem(self.clusters[number], options.visibility), options) for number in batch
+        ]
+
+
+_reader: _ClusterReader
+"""Of a worker process."""
+
+
+def _start_worker(parent: int, clusters_dir: Path) -> None:
+    global _reader
+    die_with_parent(parent)
+    _reader = _ClusterReader(clusters_dir)
+
+
+def _select_in_worker(batch: range, options: SelectionOptions) -> list[Selection]:
+    return _reader.select(batch, options)
+
+
+def _solved(reader: _ClusterReader, options: SelectionOptions, num_workers: int) -> Iterator[Selection]:
+    """Selections in the order of the clusters, with few of them in memory.
+
+    This process works too, on what no worker has begun: those need a while to start.
+    """
+    total = len(reader.clusters)
+    batches = iter([range(first, min(first + _BATCH, total)) for first in range(0, total, _BATCH)])
     if num_workers == 1:
-        yield from (select_views(problem, options) for problem in problems)
+        for batch in batches:
+            yield from reader.select(batch, options)
         return
     with ProcessPoolExecutor(
-        num_workers, multiprocessing.get_context("spawn"), initializer=die_with_parent, initargs=(os.getpid(),)
+        num_workers - 1,
+        multiprocessing.get_context("spawn"),
+        initializer=_start_worker,
+        initargs=(os.getpid(), reader.folder),
     ) as executor:
-        problems = iter(problems)
-        running = deque[Future[Selection]]()
-        for problem in islice(problems, 2 * num_workers):
-            running.append(executor.submit(select_views, problem, options))
-        while running:
-            yield running.popleft().result()
-            for problem in islice(problems, 1):
-                running.append(executor.submit(select_views, problem, options))
+        running = deque[tuple[range, Future[list[Selection]]]]()
+        while True:
+            for batch in islice(batches, 3 * num_workers - len(running)):
+                running.append((batch, executor.submit(_select_in_worker, batch, options)))
+            if not running:
+                return
+            batch, future = running.popleft()
+            yield from reader.select(batch, options) if future.cancel() else future.result()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,29 +25,36 @@ def unpack_rows(bits: NDArray[np.uint64], num_columns: int) -> NDArray[np.bool_]
     return flat[:, :num_columns].astype(np.bool_)
 
 
-def visible_points(problem: ViewProblem, visibility: Visibility) -> NDArray[np.uint64]:
-    """(P_c, words) the matrix B^T of [O]: which views see each keypoint and each sample, packed."""
+@dataclass(frozen=True, kw_only=True)
+class VisiblePoints:
+    """Which views see which of a cluster's points, packed in both directions. P_c points: keypoints, then samples."""
+
+    by_view: NDArray[np.uint64]
+    """(N_c, ceil(P_c / 64)) points that each view sees."""
+    by_point: NDArray[np.uint64]
+    """(P_c, ceil(N_c / 64)) views that see each point: the matrix B^T of [O]."""
+
+    @property
+    def num_seen(self) -> NDArray[np.int64]:
+        """(N_c,) how many points each view sees."""
+        counts: NDArray[np.int64] = np.bitwise_count(self.by_view).sum(axis=1, dtype=np.int64)
+        return counts
+
+
+def visible_points(problem: ViewProblem, visibility: Visibility) -> VisiblePoints:
+    """Which views see each keypoint and each sample."""
     if visibility is Visibility.FRUSTUM:
         points = np.concatenate([problem.keypoints_in_world, problem.samples_in_world])
-        return frustum_bits(points, problem.image_from_world, problem.sizes_px)
+        by_view = frustum_bits(np.ascontiguousarray(points.T), problem.image_from_world, problem.sizes_px)
+        return VisiblePoints(by_view=by_view, by_point=transpose_bits(by_view, len(points)))
+    samples = frustum_bits(np.ascontiguousarray(problem.samples_in_world.T), problem.image_from_world, problem.sizes_px)
     tracked = np.zeros((len(problem.keypoints_in_world), len(problem.image_names)), dtype=np.bool_)
     tracked[problem.observations[:, 0], problem.observations[:, 1]] = True
-    samples = frustum_bits(problem.samples_in_world, problem.image_from_world, problem.sizes_px)
-    return np.concatenate([pack_rows(tracked), samples])
+    by_point = np.concatenate([pack_rows(tracked), transpose_bits(samples, len(problem.samples_in_world))])
+    return VisiblePoints(by_view=transpose_bits(by_point, len(problem.image_names)), by_point=by_point)
 
 
-def matching_views(
-    visible: NDArray[np.uint64], num_views: int, min_shared_points: int
-) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Which pairs of views match, and how many points each view sees.
-
-    Args:
-        visible: From :func:`visible_points`.
-        num_views: N_c.
-        min_shared_points: Common points that make two views match.
-
-    Returns:
-        (N_c, N_c) the matrix S~ of [O] with a false diagonal, and (N_c,).
-    """
-    by_view = transpose_bits(visible, num_views)
-    return share_at_least(by_view, min_shared_points), np.bitwise_count(by_view).sum(axis=1, dtype=np.int64)
+def matching_views(visible: VisiblePoints, min_shared_points: int) -> NDArray[np.bool_]:
+    """(N_c, N_c) the matrix S~ of [O] with a false diagonal: which pairs of views see that many common points."""
+    matches: NDArray[np.bool_] = share_at_least(visible.by_view, min_shared_points)
+    return matches

@@ -15,8 +15,9 @@ from app.clustering.clusters import cluster_views
 from app.clustering.options import ClusteringOptions
 from app.view_selection.explanation import Explanation, Reason, explain_selection
 from app.view_selection.ilp import ViewProgram, smallest_selection, total_quality
-from app.view_selection.options import SelectionMethod, SelectionOptions
+from app.view_selection.options import SelectionMethod, SelectionOptions, Visibility
 from app.view_selection.problem import ProblemCutter
+from app.view_selection.quality import ViewQuality
 from app.view_selection.reduction import covering_rows
 from app.view_selection.selection import select_views
 from app.view_selection.visibility import pack_rows
@@ -43,7 +44,7 @@ class Case:
         self.bounds = np.minimum((self.visible & self.usable).sum(axis=1), n_vis)
         self.forced = self.usable & (rng.random(num_views) < 0.15)
         self.min_views = int(rng.integers(0, self.usable.sum() + 1))
-        self.quality, self.viewpoint = rng.integers(0, 5, num_views) * 1.5, rng.integers(0, 4, num_views)
+        self.worth = ViewQuality(quality=rng.integers(0, 5, num_views) * 1.5, viewpoint=rng.integers(0, 4, num_views))
         rows, _ = covering_rows(pack_rows(self.visible), pack_rows(self.usable[None])[0], n_vis)
         program = ViewProgram(
             rows=rows,
@@ -53,7 +54,7 @@ class Case:
             n_match=n_match,
             min_views=self.min_views,
         )
-        self.selected = smallest_selection(program, self.quality, 1000).selected
+        self.selected = smallest_selection(program, self.worth.quality, 1000).selected
         if spare:
             more = self.selected | (self.usable & (rng.random(num_views) < 0.3))
             if not self.broken(more):
@@ -68,8 +69,7 @@ class Case:
             n_vis=n_vis,
             n_match=n_match,
             min_views=self.min_views,
-            quality=self.quality,
-            viewpoint=self.viewpoint,
+            worth=self.worth,
         )
 
     def broken(self, selected: np.ndarray) -> set[tuple[str, int]]:
@@ -101,9 +101,7 @@ def test_a_view_is_held_by_exactly_the_constraints_that_break_without_it(case: C
         assert (Reason.UNPROVEN in reasons) == (not broken and not case.forced[view])
         assert (Reason.FILLS in reasons) == (broken == {("size", 0)} and not case.forced[view])
         assert explanation.forced[place] == case.forced[view]
-        lost = total_quality(case.selected, case.quality, case.viewpoint) - total_quality(
-            without, case.quality, case.viewpoint
-        )
+        lost = total_quality(case.selected, case.worth) - total_quality(without, case.worth)
         assert explanation.added_quality[place] == pytest.approx(lost)
 
 
@@ -142,9 +140,9 @@ def test_an_explanation_comes_back_from_json(case: Case) -> None:
 def test_selections_of_scenes_are_explained_by_what_their_views_see(seed: int, method: SelectionMethod) -> None:
     scene = random_scene(seed, num_images=20)
     clustering = cluster_views(scene, ClusteringOptions(sample_spacing_m=4.0, min_cameras_per_cluster=3))
-    cutter = ProblemCutter(scene, clustering.grid)
+    cutter = ProblemCutter(scene)
     for cluster in clustering.clusters[:3]:
-        problem = cutter.problem(cluster)
+        problem = cutter.problem(cluster, Visibility.FRUSTUM)
         found = select_views(problem, SelectionOptions(method=method, n_low=3, n_high=6, min_shared_points=3))
         explanation = found.explanation
         selected = np.isin(problem.image_names, found.image_names)

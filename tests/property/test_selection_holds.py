@@ -21,7 +21,7 @@ from app.view_selection.ilp import (
 )
 from app.view_selection.options import SelectionMethod, SelectionOptions, Visibility
 from app.view_selection.problem import ProblemCutter, ViewProblem
-from app.view_selection.quality import view_quality, viewpoints
+from app.view_selection.quality import ViewQuality, view_quality
 from app.view_selection.reduction import CoveringRows, covering_rows, reduce_rows, required_views
 from app.view_selection.selection import select_views
 from app.view_selection.visibility import pack_rows, unpack_rows, visible_points
@@ -66,7 +66,7 @@ def _random_program(seed: int, num_views: int) -> tuple[ViewProgram, np.ndarray]
 def test_the_solver_finds_the_optimum_of_brute_force(seed: int, num_views: int) -> None:
     program, visible = _random_program(seed, num_views)
     rng = np.random.default_rng(seed)
-    quality, viewpoint = rng.uniform(0, 5, num_views), rng.integers(0, 4, num_views)
+    worth = ViewQuality(quality=rng.uniform(0, 5, num_views), viewpoint=rng.integers(0, 4, num_views))
     bounds = np.minimum((visible & program.usable).sum(axis=1), 2)
     feasible = [
         subset
@@ -78,15 +78,15 @@ def test_the_solver_finds_the_optimum_of_brute_force(seed: int, num_views: int) 
         and ((program.matches @ subset.astype(int))[subset] >= 2).all()
     ]
     smallest = min(subset.sum() for subset in feasible)
-    best = max(total_quality(subset, quality, viewpoint) for subset in feasible if subset.sum() == smallest)
+    best = max(total_quality(subset, worth) for subset in feasible if subset.sum() == smallest)
 
-    greedy = greedy_selection(program, quality)
+    greedy = greedy_selection(program, worth.quality)
     assert any(np.array_equal(greedy, subset) for subset in feasible)
     for reduced in (program, replace(program, rows=reduce_rows(program.rows, pack_rows(program.fixed[None])[0]))):
-        found = smallest_selection(reduced, quality, 1000)
+        found = smallest_selection(reduced, worth.quality, 1000)
         assert any(np.array_equal(found.selected, subset) for subset in feasible)
         assert found.selected.sum() == smallest == found.size_bound
-        found = best_selection(reduced, found, quality, viewpoint, 1000)
+        found = best_selection(reduced, found, worth, 1000)
         assert any(np.array_equal(found.selected, subset) for subset in feasible)
         assert found.selected.sum() == smallest
         assert found.quality == pytest.approx(best)
@@ -120,8 +120,8 @@ def _problems(seed: int, num_images: int) -> list[ViewProblem]:
     scene = random_scene(seed, num_images=num_images)
     options = ClusteringOptions(sample_spacing_m=4.0, min_cameras_per_cluster=3)
     clustering = cluster_views(scene, options)
-    cutter = ProblemCutter(scene, clustering.grid)
-    return [cutter.problem(cluster) for cluster in clustering.clusters]
+    cutter = ProblemCutter(scene)
+    return [cutter.problem(cluster, Visibility.TRACKS) for cluster in clustering.clusters]
 
 
 @few
@@ -179,9 +179,8 @@ def test_optimal_is_never_larger_than_paper_and_best_among_its_size(seed: int) -
         assert len(optimal.image_names) <= len(paper.image_names)
         if len(optimal.image_names) == len(paper.image_names) and paper.image_names:
             visible = visible_points(problem, options.visibility)
-            quality, viewpoint = view_quality(problem, visible), viewpoints(problem, visible)
             chosen = np.isin(problem.image_names, paper.image_names)
-            assert optimal.quality >= total_quality(chosen, quality, viewpoint) - 1e-6
+            assert optimal.quality >= total_quality(chosen, view_quality(problem, visible)) - 1e-6
 
 
 @few
@@ -206,8 +205,8 @@ def test_ids_and_the_order_of_points_do_not_matter(seed: int, order: int, method
     clustering = cluster_views(scene, ClusteringOptions(sample_spacing_m=4.0))
     options = SelectionOptions(method=method)
     for cluster in clustering.clusters[:4]:
-        expected = select_views(ProblemCutter(scene, clustering.grid).problem(cluster), options)
-        assert select_views(ProblemCutter(other, clustering.grid).problem(cluster), options) == expected
+        expected = select_views(ProblemCutter(scene).problem(cluster, Visibility.TRACKS), options)
+        assert select_views(ProblemCutter(other).problem(cluster, Visibility.TRACKS), options) == expected
 
 
 def test_rows_without_points() -> None:

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from app.scene.posed_scene import PosedScene
+from app.scene.posed_scene import ImageNames, PosedScene, projection_centers
+from tests.reference.visibility import mean_directions
 
 WIDTH, HEIGHT, FOCAL = 640, 400, 320.0
 
@@ -27,17 +28,19 @@ def make_scene(
     names = tuple(sorted(cameras))
     tracks = tracks if tracks is not None else [names[:2]] * len(points)
     rows = [sorted(names.index(name) for name in track) for track in tracks]
+    positions, poses = np.asarray(points, dtype=np.float64).reshape(-1, 3), np.array([cameras[name] for name in names])
     return PosedScene(
-        image_names=names,
+        image_names=ImageNames.of(names),
         image_ids=np.arange(1, len(names) + 1, dtype=np.int64),
         camera_index=np.zeros(len(names), dtype=np.int32),
-        cam_from_world=np.array([cameras[name] for name in names]),
+        cam_from_world=poses,
         camera_ids=np.array([1], dtype=np.int64),
         camera_params_px=np.array([[FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]]),
         camera_sizes_px=np.array([[WIDTH, HEIGHT]], dtype=np.int32),
         point_ids=np.arange(1, len(points) + 1, dtype=np.int64),
-        points_in_world=np.asarray(points, dtype=np.float64).reshape(-1, 3),
+        points_in_world=positions,
         point_colors=np.full((len(points), 3), 128, dtype=np.uint8),
+        point_normals=mean_directions(positions, [sorted(set(row)) for row in rows], projection_centers(poses)),
         track_offsets=np.concatenate([[0], np.cumsum([len(row) for row in rows])]).astype(np.int64),
         track_images=np.array([row for track in rows for row in track], dtype=np.int32),
     )
@@ -77,6 +80,7 @@ def shuffled(scene: PosedScene, seed: int) -> tuple[PosedScene, np.ndarray]:
             point_ids=scene.point_ids,
             points_in_world=scene.points_in_world[order],
             point_colors=scene.point_colors[order],
+            point_normals=scene.point_normals[order],
             track_offsets=np.concatenate([[0], np.cumsum([len(track) for track in tracks])]).astype(np.int64),
             track_images=np.concatenate(tracks),
         ),

@@ -47,6 +47,34 @@ def undominated(rows: list[set[int]], bounds: list[int]) -> list[bool]:
     return keep
 
 
+def mean_directions(points: np.ndarray, tracks: list[list[int]], centers: np.ndarray) -> np.ndarray:
+    """(P, 3) unit vectors along the mean direction from each point to the images in its track."""
+    directions = np.zeros((len(points), 3))
+    for point, track in enumerate(tracks):
+        towards = [centers[image] - points[point] for image in track]
+        mean = np.sum([t / np.linalg.norm(t) for t in towards if t.any()], axis=0)
+        if np.any(mean):
+            directions[point] = mean / np.linalg.norm(mean)
+    return directions.astype(np.float32)
+
+
+def resolution_on_surface(
+    seen: np.ndarray, points: np.ndarray, normals: np.ndarray, centers: np.ndarray, focal_lengths_px: np.ndarray
+) -> tuple[np.ndarray, list[float]]:
+    """Sum of relative resolutions per image, and the distances of all that is seen."""
+    total, distances = np.zeros(len(centers)), []
+    for views, point, normal in zip(seen, points, normals, strict=True):
+        resolution = np.zeros(len(centers))
+        for view in np.flatnonzero(views):
+            towards = centers[view] - point
+            distance = float(np.linalg.norm(towards))
+            distances.append(distance)
+            resolution[view] = focal_lengths_px[view] * max(0.0, normal @ towards / distance) / distance
+        if resolution.max() > 0:
+            total += resolution / resolution.max()
+    return total, distances
+
+
 def image_records(data: bytes) -> list[tuple[int, str]]:
     """Image ID and name of each record of an images.bin."""
     (count,), position, records = struct.unpack_from("<Q", data), 8, []

@@ -11,12 +11,12 @@ import pytest
 
 from app.clustering.association import Block, DropReason
 from app.clustering.clusters import Clustering, cluster_views
-from app.clustering.grid import CellIndex
 from app.clustering.merging import merge_small_blocks
 from app.clustering.options import ClusteringOptions
 from app.clustering.samples import grid_points, height_range, sample_axes
 from app.clustering.stage import cluster
 from app.errors import InputError
+from app.scene.point_index import PointIndex, tile_keys
 from app.scene.posed_scene import PosedScene
 from app.scene.submodel import write_submodel
 from tests.reference.posed_scenes import level_camera, make_scene
@@ -130,12 +130,17 @@ def test_samples_fill_a_box_evenly() -> None:
     assert len(np.unique(grid_points((x, y, z)), axis=0)) == 8
 
 
-def test_cell_index_finds_rows_in_a_rectangle() -> None:
-    cells = np.random.default_rng(0).integers(-5, 5, (300, 2))
-    index = CellIndex(cells)
-    for low, high in (((-2, -3), (1, 4)), ((-9, -9), (9, 9)), ((0, 0), (0, 0)), ((7, 7), (9, 9))):
-        inside = np.all((cells >= low) & (cells <= high), axis=1)
-        assert index.rows_between(low, high).tolist() == np.flatnonzero(inside).tolist()
+@pytest.mark.parametrize("is_sorted", [True, False])
+def test_point_index_finds_rows_in_a_rectangle(is_sorted: bool) -> None:
+    points = np.random.default_rng(0).uniform(-300, 300, (3000, 3))
+    points[::50] *= 1e12
+    if is_sorted:
+        points = points[np.argsort(tile_keys(points))]
+    index = PointIndex(points)
+    for low, high in (((-20, -3), (10, 140)), ((-310, -310), (310, 310)), ((7, 7), (9, 9)), ((900, 0), (950, 20))):
+        inside = np.all((points[:, :2] >= low) & (points[:, :2] <= high), axis=1)
+        found = index.rows_between(np.array(low, dtype=float), np.array(high, dtype=float))
+        assert found.tolist() == np.flatnonzero(inside).tolist()
 
 
 def _block(i: int, j: int, images: list[int]) -> Block:

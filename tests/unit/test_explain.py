@@ -21,7 +21,7 @@ from app.stage import run_stage
 from app.stages import cluster_stage, select_stage
 from app.view_selection.describe import describe_selection, describe_view
 from app.view_selection.explanation import Coverage, Explanation
-from app.view_selection.options import SelectionOptions
+from app.view_selection.options import SelectionOptions, Visibility
 from app.view_selection.problem import ProblemCutter
 from app.view_selection.selection import Selection, read_selections, select_views
 from app.workspace import Workspace
@@ -105,7 +105,7 @@ def test_words_for_a_cluster_without_a_stereo_pair() -> None:
     cameras = {"a.jpg": level_camera([5, 0, 1.5], 0), "b.jpg": level_camera([5, 0, 1.5], 180)}
     scene = make_scene(cameras, [[10 + 0.1 * k, 0, 1] for k in range(9)])
     clustering = cluster_views(scene, ClusteringOptions())
-    problem = ProblemCutter(scene, clustering.grid).problem(clustering.clusters[0])
+    problem = ProblemCutter(scene).problem(clustering.clusters[0], Visibility.FRUSTUM)
     text = describe_selection(select_views(problem, SelectionOptions()))
     assert text.startswith(f"cluster {problem.cluster}: 0 of 2 views selected")
     assert "100.0 %" not in text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,20 +10,34 @@ import pycolmap
 import pytest
 
 from app.errors import InputError
+from app.scene import model_pieces, read_model
 from app.scene.kernels import index_images, index_points
+from app.scene.point_index import tile_keys
 from app.scene.posed_scene import PosedScene
 from app.scene.read_model import read_posed_scene
 from app.scene.submodel import write_submodel
 from tests.reference.posed_scenes import level_camera, make_scene, random_scene
 
 
+def _tracks_by_id(scene: PosedScene) -> dict[int, tuple[object, ...]]:
+    """All that is known of each point."""
+    return {
+        int(scene.point_ids[p]): (
+            scene.points_in_world[p].tolist(),
+            scene.point_colors[p].tolist(),
+            scene.point_normals[p].round(5).tolist(),
+            scene.track_images[scene.track_offsets[p] : scene.track_offsets[p + 1]].tolist(),
+        )
+        for p in range(len(scene.point_ids))
+    }
+
+
 def _equal(a: PosedScene, b: PosedScene) -> None:
     assert a.image_names == b.image_names
     np.testing.assert_allclose(a.cam_from_world, b.cam_from_world, atol=1e-12)
-    for name in ("image_ids", "camera_ids", "camera_params_px", "camera_sizes_px", "point_ids", "points_in_world"):
+    for name in ("image_ids", "camera_ids", "camera_params_px", "camera_sizes_px", "camera_index"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
-    for name in ("point_colors", "track_offsets", "track_images", "camera_index"):
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+    assert _tracks_by_id(a) == _tracks_by_id(b)
 
 
 def _visible_scene() -> PosedScene:
@@ -112,23 +127,67 @@ def _model_bytes(folder: Path) -> Path:
     return folder
 
 
+def test_points_are_stored_by_tile_and_id(tmp_path: Path) -> None:
+    write_submodel(random_scene(4), np.arange(24), np.arange(200), tmp_path)
+    scene = read_posed_scene(tmp_path)
+    keys = tile_keys(scene.points_in_world)
+    assert len(np.unique(keys)) > 5
+    np.testing.assert_array_equal(np.lexsort((scene.point_ids, keys)), np.arange(len(keys)))
+
+
+def test_pieces_make_no_difference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pieces shorter than a record, as long as some, and as long as the file; points sorted a few at a time."""
+    write_submodel(random_scene(4), np.arange(24), np.arange(200), tmp_path)
+    expected = read_posed_scene(tmp_path)
+    for piece_bytes, piece_points in ((70, 1), (1000, 7), (100_000, 150)):
+        monkeypatch.setattr(model_pieces, "_PIECE_BYTES", piece_bytes)
+        monkeypatch.setattr(read_model, "_PIECE_POINTS", piece_points)
+        found = read_posed_scene(tmp_path)
+        for name in ("point_ids", "points_in_world", "track_offsets", "track_images", "image_ids", "cam_from_world"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
+
+
+def test_image_ids_far_apart(tmp_path: Path) -> None:
+    """IDs too great for a table that tells the image of an ID."""
+    scene = random_scene(4)
+    ids = np.arange(1, 25, dtype=np.int64)
+    ids[5:] += 4_000_000_000
+    write_submodel(replace(scene, image_ids=ids), np.arange(24), np.arange(200), tmp_path / "far")
+    write_submodel(scene, np.arange(24), np.arange(200), tmp_path / "near")
+    far, near = read_posed_scene(tmp_path / "far"), read_posed_scene(tmp_path / "near")
+    np.testing.assert_array_equal(far.track_images, near.track_images)
+    np.testing.assert_array_equal(far.image_ids, ids)
+
+
+def test_two_points_with_the_same_id(tmp_path: Path) -> None:
+    path = _model_bytes(tmp_path) / "points3D.bin"
+    data = bytearray(path.read_bytes())
+    second = 8 + int(index_points(np.frombuffer(data[8:], dtype=np.uint8), 1)[1])
+    data[second : second + 8] = data[8:16]
+    path.write_bytes(bytes(data))
+    with pytest.raises(InputError, match="same ID"):
+        read_posed_scene(tmp_path)
+
+
 def test_the_order_of_records_does_not_matter(tmp_path: Path) -> None:
     write_submodel(random_scene(4), np.arange(24), np.arange(200), tmp_path)
     expected = read_posed_scene(tmp_path)
     for name, index in (("images", index_images), ("points3D", index_points)):
         path = tmp_path / f"{name}.bin"
         content = path.read_bytes()
-        found = index(np.frombuffer(content, dtype=np.uint8), int.from_bytes(content[:8], "little"))
+        found = index(np.frombuffer(content[8:], dtype=np.uint8), int.from_bytes(content[:8], "little")) + 8
         starts = found.reshape(len(found), -1)[:, 0]
         records = [content[start:end] for start, end in zip(starts[:-1], starts[1:], strict=True)]
         path.write_bytes(content[:8] + b"".join(records[::-1]))
-    _equal(read_posed_scene(tmp_path), expected)
+    found = read_posed_scene(tmp_path)
+    _equal(found, expected)
+    np.testing.assert_array_equal(found.point_ids, expected.point_ids)
 
 
 def test_names_with_spaces(tmp_path: Path) -> None:
     scene = make_scene({"a b.jpg": level_camera([0, 0, 0], 0), "c.jpg": level_camera([0, 1, 0], 0)}, [[5, 0, 0]])
     write_submodel(scene, np.arange(2), np.arange(1), tmp_path)
-    assert read_posed_scene(tmp_path).image_names == ("a b.jpg", "c.jpg")
+    assert tuple(read_posed_scene(tmp_path).image_names) == ("a b.jpg", "c.jpg")
 
 
 def test_no_model(tmp_path: Path) -> None:

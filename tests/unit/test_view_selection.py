@@ -14,12 +14,12 @@ from app.clustering.options import ClusteringOptions
 from app.clustering.stage import cluster
 from app.errors import InputError
 from app.scene.posed_scene import PosedScene
-from app.scene.read_model import read_posed_scene
+from app.scene.read_model import open_scene
 from app.scene.submodel import write_submodel
 from app.view_selection import stage
 from app.view_selection.options import SelectionMethod, SelectionOptions, Visibility
 from app.view_selection.problem import ProblemCutter, ViewProblem
-from app.view_selection.quality import view_quality, viewpoints
+from app.view_selection.quality import view_quality
 from app.view_selection.selection import read_selections, select_views
 from app.view_selection.visibility import visible_points
 from tests.reference.posed_scenes import level_camera, make_scene, random_scene
@@ -39,7 +39,7 @@ def _problem(scene: PosedScene, *, spacing: float = 20.0) -> ViewProblem:
         is_small=False,
         image_names=scene.image_names,
     )
-    return ProblemCutter(scene, grid).problem(found)
+    return ProblemCutter(scene).problem(found, Visibility.TRACKS)
 
 
 def _abreast(count: int, step: float = 0.5, x: float = 0.0) -> dict[str, np.ndarray]:
@@ -69,7 +69,7 @@ def test_an_image_that_is_not_in_the_model() -> None:
         image_names=scene.image_names,
     )  # fmt: skip
     with pytest.raises(InputError, match=r"02\.jpg.*not in the model"):
-        ProblemCutter(problem_scene, grid).problem(found)
+        ProblemCutter(problem_scene).problem(found, Visibility.TRACKS)
 
 
 def test_n_min_views_are_enough_where_all_see_all() -> None:
@@ -127,9 +127,8 @@ def test_near_and_frontal_views_are_better_and_the_back_of_a_wall_counts_nothing
     }
     points = [[10 + 0.001 * k, 0.2 * k - 1, 1.5] for k in range(10)]
     problem = _problem(make_scene(cameras, points, [["far.jpg", "near.jpg"]] * 10))
-    quality = dict(
-        zip(problem.image_names, view_quality(problem, visible_points(problem, Visibility.FRUSTUM)), strict=True)
-    )
+    worth = view_quality(problem, visible_points(problem, Visibility.FRUSTUM))
+    quality = dict(zip(problem.image_names, worth.quality, strict=True))
     assert quality["near.jpg"] == pytest.approx(10, rel=0.01)
     assert quality["far.jpg"] == pytest.approx(5, rel=0.05)
     assert quality["oblique.jpg"] == pytest.approx(5 * np.cos(np.radians(60)), rel=0.1)
@@ -145,7 +144,7 @@ def test_views_from_one_place_in_one_heading_are_one_viewpoint() -> None:
         "d.jpg": level_camera([0.1, 0.1, 0.1], 45),
     }
     problem = _problem(make_scene(cameras, [[10.1, y, 1.5] for y in np.linspace(-1, 1, 9)]))
-    a, b, c, d = viewpoints(problem, visible_points(problem, Visibility.FRUSTUM))
+    a, b, c, d = view_quality(problem, visible_points(problem, Visibility.FRUSTUM)).viewpoint
     assert a == b
     assert len({a, c, d}) == 3
 
@@ -155,7 +154,7 @@ def test_optimal_spreads_the_views_over_viewpoints() -> None:
     problem = _problem(make_scene(_abreast(40), WALL))
     options = SelectionOptions(min_shared_points=5, n_low=12, n_high=12)
     visible = visible_points(problem, Visibility.FRUSTUM)
-    viewpoint = dict(zip(problem.image_names, viewpoints(problem, visible).tolist(), strict=True))
+    viewpoint = dict(zip(problem.image_names, view_quality(problem, visible).viewpoint.tolist(), strict=True))
     found = select_views(problem, options)
     assert len(found.image_names) == 12
     assert len({viewpoint[name] for name in found.image_names}) == 12
@@ -167,7 +166,7 @@ def test_keypoints_count_by_track_if_asked_to() -> None:
     tracks = [["00.jpg", "01.jpg"]] + [["02.jpg", "03.jpg"]] * (len(WALL) - 1)
     problem = _problem(make_scene(cameras, WALL, tracks))
     visible = visible_points(problem, Visibility.TRACKS)
-    assert np.bitwise_count(visible).sum() == 2 * len(WALL) + 12
+    assert np.bitwise_count(visible.by_point).sum() == 2 * len(WALL) + 12
     options = SelectionOptions(visibility=Visibility.TRACKS, min_shared_points=1, n_low=4, n_high=4)
     assert select_views(problem, options).image_names == ("00.jpg", "01.jpg", "02.jpg", "03.jpg")
 
@@ -179,13 +178,13 @@ def test_minimum_number_of_views_adapts_and_is_clamped() -> None:
 
 def test_stage_does_not_depend_on_the_number_of_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stage, "_MIN_CLUSTERS_PER_WORKER", 1)
+    monkeypatch.setattr(stage, "_BATCH", 1)
     write_submodel(random_scene(5), np.arange(24), np.arange(200), tmp_path / "model")
     options = ClusteringOptions(sample_spacing_m=4.0, block_size_m=(10.0, 10.0))
     clustering = cluster(tmp_path / "model", tmp_path / "clusters", options=options)
     steps: list[tuple[int, int]] = []
     for workers in (1, 2):
         stage.select(
-            tmp_path / "model",
             tmp_path / "clusters",
             tmp_path / str(workers),
             options=SelectionOptions(),
@@ -199,8 +198,8 @@ def test_stage_does_not_depend_on_the_number_of_workers(tmp_path: Path, monkeypa
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
     selections = list(read_selections(tmp_path / "1"))
     assert [s.cluster for s in selections] == [c.name for c in clustering.clusters]
-    cutter = ProblemCutter(read_posed_scene(tmp_path / "model"), clustering.grid)
-    assert selections[0] == select_views(cutter.problem(clustering.clusters[0]), SelectionOptions())
+    cutter = ProblemCutter(open_scene(tmp_path / "clusters" / "scene"))
+    assert selections[0] == select_views(cutter.problem(clustering.clusters[0], Visibility.TRACKS), SelectionOptions())
     report = json.loads((tmp_path / "1" / "report.json").read_text())
     assert report["num_images_after_selection"] == sum(len(s.image_names) for s in selections)
     assert report["clusters_without_stereo_pair"] == [s.cluster for s in selections if not s.image_names]
@@ -232,5 +231,7 @@ def test_a_clustering_read_back_gives_the_same_problems(tmp_path: Path) -> None:
     assert again == clustering
     options = SelectionOptions(method=SelectionMethod.PAPER)
     for a, b in zip(clustering.clusters[:3], again.clusters[:3], strict=True):
-        cutter = ProblemCutter(scene, again.grid)
-        assert select_views(cutter.problem(a), options) == select_views(cutter.problem(b), options)
+        cutter = ProblemCutter(scene)
+        assert select_views(cutter.problem(a, Visibility.TRACKS), options) == select_views(
+            cutter.problem(b, Visibility.TRACKS), options
+        )
