@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 
 from app.sfm.database import open_database
+from app.sfm.descriptors import Matches, match_descriptors
 from app.sfm.features import cuda_works
 from app.sfm.options import SfmOptions
 from app.sfm.pairs import Pair
@@ -18,7 +21,7 @@ from app.workspace import atomic_file
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[int, int], None]
-_BATCH = 500
+_BATCH = 200
 """Pairs between two reports of progress."""
 
 
@@ -34,36 +37,79 @@ def match_pairs(
         options: seed, threads, GPU.
         progress: called with pairs done and pairs in all.
     """
-    with _plain_names(database_path, image_names) as plain_names:
-        ids = _ids_by_name(database_path)
-        with pycolmap.Database.open(database_path) as database:
-            verified = set(database.read_two_view_geometry_num_inliers()[0])
-        missing = [
-            pair
-            for pair in ((plain_names[first], plain_names[second]) for first, second in pairs)
-            if pycolmap.image_pair_to_pair_id(ids[pair[0]], ids[pair[1]]) not in verified
-        ]
-        for start in range(0, len(missing), _BATCH):
-            batch = missing[start : start + _BATCH]
-            _match(database_path, batch, options)
-            progress(len(pairs) - len(missing) + start + len(batch), len(pairs))
+    if not cuda_works(options):
+        _match_missing(_match, database_path, pairs, options, progress)
+        return
+    with _plain_names(database_path, image_names) as plain:
+        plain_pairs = [(plain[first], plain[second]) for first, second in pairs]
+        _match_missing(_match_on_gpu, database_path, plain_pairs, options, progress)
+
+
+def _match_missing(
+    match: Callable[[Path, Sequence[Pair], SfmOptions], None],
+    database_path: Path,
+    pairs: Sequence[Pair],
+    options: SfmOptions,
+    progress: Progress,
+) -> None:
+    with pycolmap.Database.open(database_path) as database:
+        ids = _pair_ids(database, pairs)
+        missing = [pair for pair, key in zip(pairs, ids, strict=True) if not database.exists_two_view_geometry(*key)]
+    for start in range(0, len(missing), _BATCH):
+        batch = missing[start : start + _BATCH]
+        match(database_path, batch, options)
+        progress(len(pairs) - len(missing) + start + len(batch), len(pairs))
 
 
 def _match(database_path: Path, pairs: Sequence[Pair], options: SfmOptions) -> None:
+    verification = _verification(options)
+    with pycolmap.Database.open(database_path) as database, ThreadPoolExecutor(options.threads) as pool:
+        ids = _pair_ids(database, pairs)
+        images = {image_id: database.read_image(image_id) for image_id in sorted({i for pair in ids for i in pair})}
+        cameras = {image_id: database.read_camera(image.camera_id) for image_id, image in images.items()}
+        points = {i: np.asarray(database.read_keypoints(i), np.float64)[:, :2] for i in images}
+        descriptors = {i: np.asarray(database.read_descriptors(i).data, np.uint8) for i in images}
+
+        def work(pair: tuple[int, int]) -> tuple[Matches, pycolmap.TwoViewGeometry]:
+            first, second = pair
+            matches = match_descriptors(descriptors[first], descriptors[second])
+            geometry = pycolmap.estimate_two_view_geometry(
+                cameras[first], points[first], cameras[second], points[second], matches, verification
+            )
+            return matches, geometry
+
+        found = list(pool.map(work, ids))
+        with pycolmap.DatabaseTransaction(database):
+            for (first, second), (matches, geometry) in zip(ids, found, strict=True):
+                if database.exists_matches(first, second):
+                    database.delete_matches(first, second)
+                database.write_matches(first, second, matches)
+                database.write_two_view_geometry(first, second, geometry)
+
+
+def _match_on_gpu(database_path: Path, pairs: Sequence[Pair], options: SfmOptions) -> None:
     pair_list = database_path.with_suffix(".pairs.txt")
     with atomic_file(pair_list) as path:
         path.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
-    gpu = cuda_works(options)
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = options.seed
     pycolmap.match_image_pairs(
         database_path,
-        matching_options=pycolmap.FeatureMatchingOptions(num_threads=options.threads, use_gpu=gpu),
+        matching_options=pycolmap.FeatureMatchingOptions(num_threads=options.threads, use_gpu=True),
         pairing_options=pycolmap.ImportedPairingOptions(match_list_path=pair_list),
-        verification_options=verification,
-        device=pycolmap.Device.cuda if gpu else pycolmap.Device.cpu,
+        verification_options=_verification(options),
+        device=pycolmap.Device.cuda,
     )
     pair_list.unlink()
+
+
+def _verification(options: SfmOptions) -> pycolmap.TwoViewGeometryOptions:
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = options.seed
+    return verification
+
+
+def _pair_ids(database: pycolmap.Database, pairs: Sequence[Pair]) -> list[tuple[int, int]]:
+    ids = {image.name: image.image_id for image in database.read_all_images()}
+    return [(ids[first], ids[second]) for first, second in pairs]
 
 
 @contextmanager
@@ -90,8 +136,3 @@ def _rename(database_path: Path, new_names: dict[str, str]) -> None:
             if new_names.get(image.name, image.name) != image.name:
                 image.name = new_names[image.name]
                 database.update_image(image)
-
-
-def _ids_by_name(database_path: Path) -> dict[str, int]:
-    with pycolmap.Database.open(database_path) as database:
-        return {image.name: image.image_id for image in database.read_all_images()}

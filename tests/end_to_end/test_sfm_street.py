@@ -95,17 +95,18 @@ def test_all_images_register_accurately_and_to_scale(finished: tuple[Path, SfmRe
 def test_the_same_bytes_again_and_after_a_kill(
     street: Inventory, finished: tuple[Path, SfmReport], tmp_path: Path
 ) -> None:
-    """What a kill leaves: features, half of the matches, no model."""
+    """What a kill leaves: features, half of the matches, a few of them unverified, no model."""
     output, _ = finished
     again = tmp_path / "again"
     again.mkdir()
     shutil.copy(output / "database.db", again)
     with pycolmap.Database.open(again / "database.db") as database:
         pairs = database.read_two_view_geometry_num_inliers()[0]
-        for pair_id in pairs[::2]:
+        for index, pair_id in enumerate(pairs[::2]):
             first, second = pycolmap.pair_id_to_image_pair(pair_id)
-            database.delete_matches(first, second)
             database.delete_two_view_geometry(first, second)
+            if index > 2:
+                database.delete_matches(first, second)
         images = database.read_all_images()
     steps: list[int] = []
     run_sfm(street, again, options=OPTIONS, progress=lambda done, total: steps.append(done))
