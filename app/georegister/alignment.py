@@ -98,7 +98,10 @@ def _is_clearly_better(levered: PlanarFit, plain: PlanarFit) -> bool:
 def _least_median(
     source: NDArray[np.complex128], target: NDArray[np.complex128], rng: np.random.Generator, scale: float | None
 ) -> tuple[complex, complex, float] | None:
-    """Factor, offset and median residual of the pair whose similarity has the smallest median residual."""
+    """Factor, offset and median residual of the pair whose similarity has the smallest median residual.
+
+    The median of F residuals, of which two are 0, is the (F + 3) / 2-th smallest (Rousseeuw and Leroy 1987, 3.4).
+    """
     pairs = rng.integers(0, len(source), (_TRIALS, 2))
     base = source[pairs[:, 1]] - source[pairs[:, 0]]
     usable = np.abs(base) > 1e-6 * float(np.abs(source - source.mean()).max())
@@ -111,7 +114,9 @@ def _least_median(
         return None
     offsets = target[pairs[:, 0]] - factors * source[pairs[:, 0]]
     scored = _scored_rows(len(source), rng)
-    medians = np.median(np.abs(factors[:, None] * source[scored] + offsets[:, None] - target[scored]), axis=1)
+    residuals = np.abs(factors[:, None] * source[scored] + offsets[:, None] - target[scored])
+    middle = (len(scored) + 3) // 2 - 1
+    medians = np.partition(residuals, middle, axis=1)[:, middle]
     best = int(np.argmin(medians))
     return complex(factors[best]), complex(offsets[best]), float(medians[best])
 
