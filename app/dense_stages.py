@@ -20,6 +20,7 @@ from app.scene.model_pieces import binary_model, read_cameras
 from app.scene.point_index import PointIndex
 from app.scene.read_model import open_scene
 from app.stage import finished_product, is_current, run_stage
+from app.versions import program_version
 from app.view_selection.selection import read_selections
 from app.workspace import atomic_file, remove_tree
 from fusion.merge import merge_clouds
@@ -67,7 +68,8 @@ def _write_jobs(
             "clusters": finished_product(run.workspace.root / "clusters", "cluster"),
             "model": finished_product(run.workspace.root / "georegister", "georegister"),
             "images": finished_product(run.workspace.root / "capture", "capture"),
-        },
+        }
+        | program_version("jobs"),
         work=work,
         product=lambda made: "",
     )

@@ -16,6 +16,7 @@ from app.executor import run_jobs
 from app.log import ProgressLine
 from app.options import DensifyOptions
 from app.stage import StageRecord, digest_files, is_current, run_stage
+from app.versions import program_version
 from fusion.cloud import write_ply
 from fusion.depth_fusion import FusionOptions, fuse_depth_maps
 from fusion.merge import crop_cloud
@@ -60,7 +61,7 @@ def densify_job(
 
 def densify_inputs(job_folder: Path) -> dict[str, str]:
     """What a dense workspace is made from."""
-    return {"job": digest_files([job_folder])}
+    return {"job": digest_files([job_folder])} | program_version("densify")
 
 
 def fuse_job(job_folder: Path, dense: Path, output: Path, options: FusionOptions, report: Report) -> None:
@@ -91,7 +92,7 @@ def fuse_job(job_folder: Path, dense: Path, output: Path, options: FusionOptions
 def fuse_inputs(dense: Path) -> dict[str, str]:
     """What a cluster's cloud is made from."""
     record = StageRecord.read(dense)
-    return {"maps": record.product if record else "missing"}
+    return {"maps": record.product if record else "missing"} | program_version("fuse")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,6 +12,7 @@ from app.executor import available_cores, split_cores
 from app.log import ProgressLine
 from app.run import Run
 from app.stage import digest, digest_files, finished_product, run_stage
+from app.versions import program_version
 
 logger = logging.getLogger(__name__)
 
@@ -56,7 +57,8 @@ def capture_stage(run: Run, sources: CaptureSources) -> None:
                 ("rig file", sources.rig),
                 ("masks", sources.masks),
             )
-        },
+        }
+        | program_version("capture"),
         work=work,
         product=lambda folder: _inventory_digest(Inventory.read(folder / "inventory.json")),
     )
@@ -84,7 +86,8 @@ def sfm_stage(run: Run, *, model: Path | None, poses: Path | None) -> None:
             "images": inventory_product,
             "imported model": digest_files([model]) if model else "none",
             "known poses": digest_files([poses]) if poses else "none",
-        },
+        }
+        | program_version("sfm"),
         work=work,
         product=lambda folder: digest_files([folder / "model"]),
     )
@@ -118,7 +121,7 @@ def georegister_stage(run: Run) -> None:
     run_stage(
         run.workspace.root / "georegister",
         options=run.config.georegister,
-        inputs={"model": model_product, "images": inventory_product},
+        inputs={"model": model_product, "images": inventory_product} | program_version("georegister"),
         work=lambda partial: georegister(
             run.workspace.sfm_model, inventory, partial, options=run.config.georegister, rig_file=inventory.rig_file
         ),
@@ -134,7 +137,7 @@ def cluster_stage(run: Run) -> None:
     run_stage(
         run.workspace.root / "clusters",
         options=run.config.clustering,
-        inputs={"model": model_product},
+        inputs={"model": model_product} | program_version("cluster"),
         work=lambda partial: cluster(run.workspace.georegistered_model, partial, options=run.config.clustering),
         product=lambda folder: digest_files([folder / "clusters.jsonl"]),
     )
@@ -142,7 +145,6 @@ def cluster_stage(run: Run) -> None:
 
 def select_stage(run: Run) -> None:
     """Choose the smallest set of views of each cluster that still sees and matches everything ([O] section 4)."""
-    from app.view_selection.selection import FORMAT_VERSION
     from app.view_selection.stage import select
 
     clusters_product = finished_product(run.workspace.root / "clusters", "cluster")
@@ -150,7 +152,7 @@ def select_stage(run: Run) -> None:
     run_stage(
         run.workspace.root / "selection",
         options=run.config.selection,
-        inputs={"clusters": clusters_product, "model": model_product, "format": str(FORMAT_VERSION)},
+        inputs={"clusters": clusters_product, "model": model_product} | program_version("select"),
         work=lambda partial: select(
             run.workspace.root / "clusters",
             partial,

@@ -176,6 +176,18 @@ def test_a_selection_option_redoes_the_clusters_whose_views_changed(finished_run
     assert f"densify: {len(changed)} of {len(after)} jobs to do" in result.stderr
 
 
+def test_an_updated_stage_is_redone_and_nothing_that_did_not_change_by_it(
+    finished_run: FinishedRun, tmp_path: Path
+) -> None:
+    workspace = finished_run.copy_to(tmp_path)
+    update = "import app.versions; app.versions._VERSIONS['cluster'] += 1"
+    assert (
+        "clusters: redoing, because of changed program version" in cityrecon("cluster", workspace, before=update).stderr
+    )
+    assert "clusters: up to date" in cityrecon("cluster", workspace, before=update).stderr
+    assert "selection: up to date" in cityrecon("select", workspace, before=update).stderr
+
+
 def test_a_rig_file_changed_in_place_is_noticed(finished_run: FinishedRun, tmp_path: Path) -> None:
     workspace = finished_run.copy_to(tmp_path)
     rig = tmp_path / "rig.json"
