@@ -10,7 +10,7 @@ from pathlib import Path
 from app.capture.inventory import Inventory
 from app.clustering.clusters import Clustering
 from app.dense_job import DenseJob, write_dense_job
-from app.densify import Task, densify_inputs, densify_job, fuse_inputs, fuse_job, run_tasks
+from app.densify import Task, densify_inputs, densify_job, densify_options, fuse_inputs, fuse_job, run_tasks
 from app.errors import CityReconError, InputError
 from app.executor import split_cores
 from app.log import ProgressLine
@@ -26,6 +26,7 @@ from app.workspace import atomic_file, remove_tree
 from fusion.merge import merge_clouds
 from fusion.region import GroundRegion
 from mvs_backends import choose_backend, get_backend
+from mvs_backends.hardware import chosen_gpus, deal_gpus, gpu_environment
 
 logger = logging.getLogger(__name__)
 
@@ -120,7 +121,13 @@ def densify_stage(run: Run, *, jobs: Mapping[str, Path], folder: Path, num_jobs:
     check_backend(run)
     inventory = Inventory.read(run.workspace.inventory_file)
     densify = _densify(run)
-    num_workers, num_threads = split_cores(len(jobs), 1 if get_backend(densify.backend).uses_gpu else num_jobs)
+    environments: list[dict[str, str]] = []
+    stereo = run.config.stereo
+    if get_backend(densify.backend).uses_gpu:
+        num_sharers = min(len(jobs), num_jobs or len(jobs))
+        environments = [gpu_environment(gpus) for gpus in deal_gpus(chosen_gpus(stereo.gpu_index), num_sharers)]
+        stereo = replace(stereo, gpu_index="-1")
+    num_workers, num_threads = split_cores(len(jobs), len(environments) or num_jobs)
     tasks = {
         name: Task(
             folder=folder / name,
@@ -132,7 +139,7 @@ def densify_stage(run: Run, *, jobs: Mapping[str, Path], folder: Path, num_jobs:
                 inventory.image_root,
                 inventory.mask_root,
                 densify,
-                run.config.stereo,
+                stereo,
                 num_threads,
             ),
             num_steps=len(DenseJob.read(job).images),
@@ -140,7 +147,14 @@ def densify_stage(run: Run, *, jobs: Mapping[str, Path], folder: Path, num_jobs:
         for name, job in jobs.items()
     }
     _remove_strangers(folder, tasks)
-    return run_tasks("densify", densify_job, tasks, num_workers=num_workers, log_file=run.workspace.log_file)
+    return run_tasks(
+        "densify",
+        densify_job,
+        tasks,
+        num_workers=num_workers,
+        log_file=run.workspace.log_file,
+        environments=environments,
+    )
 
 
 def check_backend(run: Run) -> None:
@@ -194,7 +208,7 @@ def _densify(run: Run) -> DensifyOptions:
 
 
 def _densify_options(run: Run) -> dict[str, object]:
-    return {"densify": _densify(run), "stereo": run.config.stereo}
+    return densify_options(_densify(run), run.config.stereo)
 
 
 def fuse_stage(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,11 +52,16 @@ def densify_job(
 
     run_stage(
         output,
-        options={"densify": densify, "stereo": stereo},
+        options=densify_options(densify, stereo),
         inputs=densify_inputs(job_folder),
         work=work,
         product=lambda folder: digest_files([folder / "stereo"]),
     )
+
+
+def densify_options(densify: DensifyOptions, stereo: MvsOptions) -> dict[str, object]:
+    """What a dense workspace depends on: not on where programs are, or how long they may take."""
+    return {"densify": densify, "stereo": stereo.for_record()}
 
 
 def densify_inputs(job_folder: Path) -> dict[str, str]:
@@ -113,8 +118,9 @@ def run_tasks(
     *,
     num_workers: int,
     log_file: Path,
+    environments: Sequence[Mapping[str, str]] = (),
 ) -> dict[str, str]:
-    """Run the tasks whose folders aren't up to date, in processes of their own.
+    """Run the tasks whose folders aren't up to date, in processes of their own (see `run_jobs`).
 
     Returns:
         Reason of failure by task name; empty if all succeeded.
@@ -147,5 +153,6 @@ def run_tasks(
         log_file=log_file,
         on_progress=on_progress,
         on_done=on_done,
+        environments=environments,
     )
     return failures

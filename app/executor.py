@@ -8,7 +8,7 @@ import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -42,6 +42,7 @@ def split_cores(num_tasks: int, num_jobs: int) -> tuple[int, int]:
 class _Running:
     process: multiprocessing.process.BaseProcess
     pipe: Connection
+    environment: Mapping[str, str]
     reason: str | None = None
     """Why it failed; None also while it runs."""
     reported: bool = False
@@ -55,6 +56,7 @@ def run_jobs(
     log_file: Path,
     on_progress: Callable[[str, int, int], None],
     on_done: Callable[[str, str | None], None],
+    environments: Sequence[Mapping[str, str]] = (),
 ) -> None:
     """Run ``function(*arguments, report)`` for each job.
 
@@ -65,21 +67,27 @@ def run_jobs(
         log_file: where the jobs' log records go.
         on_progress: called with (job, steps done, steps in all).
         on_done: called once per job with the reason of its failure, or None.
+        environments: variables to set in each of the processes at a time, so that each can have a GPU of its own;
+            empty: they have those of this process.
     """
     context = multiprocessing.get_context("spawn")
     waiting = list(jobs.items())[::-1]
     running: dict[str, _Running] = {}
+    free = list(environments or [{} for _ in range(num_workers)])[::-1]
     try:
         while waiting or running:
-            while waiting and len(running) < num_workers:
+            while waiting and free:
                 name, arguments = waiting.pop()
+                environment = free.pop()
                 ours, theirs = context.Pipe(duplex=False)
                 process = context.Process(
-                    target=_run_job, args=(function, arguments, theirs, log_file, os.getpid()), name=name
+                    target=_run_job,
+                    args=(function, arguments, theirs, log_file, os.getpid(), environment),
+                    name=name,
                 )
                 process.start()
                 theirs.close()
-                running[name] = _Running(process, ours)
+                running[name] = _Running(process, ours, environment)
             by_pipe = {job.pipe: name for name, job in running.items()}
             for ready in wait(list(by_pipe)):
                 name = by_pipe[ready]  # type: ignore[index]
@@ -92,6 +100,7 @@ def run_jobs(
                     if not job.reported:
                         job.reason = f"{_how_it_ended(job.process.exitcode)}; see {log_file}"
                     del running[name]
+                    free.append(job.environment)
                     on_done(name, job.reason)
                     continue
                 if message[0] == "progress":
@@ -104,7 +113,14 @@ def run_jobs(
             job.process.join()
 
 
-def _run_job(function: Job, arguments: tuple[Any, ...], pipe: Connection, log_file: Path, parent: int) -> None:
+def _run_job(
+    function: Job,
+    arguments: tuple[Any, ...],
+    pipe: Connection,
+    log_file: Path,
+    parent: int,
+    environment: Mapping[str, str],
+) -> None:
     die_with_parent(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with log_file.open("ab") as handle:
@@ -112,13 +128,20 @@ def _run_job(function: Job, arguments: tuple[Any, ...], pipe: Connection, log_fi
         os.dup2(handle.fileno(), 1)
         os.dup2(handle.fileno(), 2)
     log_to_file(log_file)
+    os.environ.update(environment)
     try:
         function(*arguments, lambda done, total: pipe.send(("progress", done, total)))
     except (CityReconError, MvsError, FusionError, OSError, MemoryError) as error:
         logger.error("%s", error, exc_info=True)
-        pipe.send(("done", str(error) or type(error).__name__))
+        pipe.send(("done", _reason(error)))
     else:
         pipe.send(("done", None))
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    return str(error) or type(error).__name__
 
 
 def _how_it_ended(exit_code: int | None) -> str:

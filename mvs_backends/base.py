@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import ClassVar
@@ -74,6 +75,9 @@ class MvsJob:
         return self.workspace / "stereo" / "normal_maps" / f"{self.views[view].name}.geometric.bin"
 
 
+_ABOUT_MACHINE = ("acmp_path", "openmvs_path", "colmap_path", "gpu_index", "cache_gib", "program_timeout_s")
+
+
 @dataclass(frozen=True, kw_only=True)
 class MvsOptions:
     """Options that every back-end understands."""
@@ -91,19 +95,27 @@ class MvsOptions:
     colmap_path: str = ""
     """COLMAP's executable built with CUDA, or its folder. Empty: pycolmap if it has CUDA, else searched on PATH."""
     gpu_index: str = "-1"
-    """GPUs for COLMAP, comma-separated; -1: all."""
-    cache_gib: float = 16.0
-    """Memory that COLMAP may keep images and maps in."""
+    """GPUs to use, counted from 0, comma-separated; -1: all."""
+    cache_gib: float = 0.0
+    """Memory that COLMAP may keep images and maps of one cluster in. 0: half of what is free, shared by the clusters
+    that are worked on at a time."""
     program_timeout_s: float = 0.0
     """A back-end's program is stopped if it works longer than this on one cluster. 0: never."""
 
     def __post_init__(self) -> None:
-        if not self.cache_gib > 0:
-            raise ValueError(f"cache_gib must be above 0, not {self.cache_gib}")
+        if not re.fullmatch(r"-1|\d+(,\d+)*", self.gpu_index):
+            raise ValueError(f"gpu_index must be -1, or numbers with commas between, not {self.gpu_index!r}")
+        if not self.cache_gib >= 0:
+            raise ValueError(f"cache_gib must be at least 0, not {self.cache_gib}")
         if not self.program_timeout_s >= 0:
             raise ValueError(f"program_timeout_s must be at least 0, not {self.program_timeout_s}")
         if self.num_source_views < 0:
             raise ValueError(f"num_source_views must be at least 0, not {self.num_source_views}")
+
+    def for_record(self) -> MvsOptions:
+        """Those that maps depend on; the others, about programs and machine, with their defaults."""
+        defaults = MvsOptions()
+        return replace(self, **{name: getattr(defaults, name) for name in _ABOUT_MACHINE})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +130,7 @@ class MvsBackend(ABC):
     """A dense multi-view stereo method. Stateless: one instance serves any number of jobs."""
 
     uses_gpu: ClassVar[bool] = False
-    """Clusters are then reconstructed one after the other."""
+    """Then as many clusters are reconstructed side by side as there are GPUs, each seeing its own only."""
 
     @abstractmethod
     def availability(self, options: MvsOptions) -> Availability:
@@ -133,4 +145,5 @@ class MvsBackend(ABC):
 
         Raises:
             MvsError: the back-end can't run here, or failed.
+            OSError: a file can't be read or written.
         """

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mvs_backends.base import MvsJob
+from mvs_backends.base import MvsError, MvsJob
 from mvs_backends.depth_range import depth_range
 from mvs_backends.masks import read_mask
 
@@ -32,12 +32,20 @@ def write_maps(job: MvsJob, view: int, depth: NDArray[np.float32], normal: NDArr
         view: reference view.
         depth: (H, W) camera z, 0 where unknown.
         normal: (H, W, 3) unit length, in the camera's frame, facing the camera.
+
+    Raises:
+        OSError: they can't be written.
     """
     paths = job.normal_map_path(view), job.depth_map_path(view)
     partials = [path.with_name(f".{path.name}.partial") for path in paths]
-    for partial, values in zip(partials, (normal, depth), strict=True):
+    for partial, path, values in zip(partials, paths, (normal, depth), strict=True):
         partial.parent.mkdir(parents=True, exist_ok=True)
-        write_map(partial, values)
+        try:
+            write_map(partial, values)
+        except OSError as error:
+            for leftover in partials:
+                leftover.unlink(missing_ok=True)
+            raise OSError(error.errno, error.strerror, str(path)) from error
     for partial, path in zip(partials, paths, strict=True):
         partial.replace(path)
 
@@ -68,8 +76,15 @@ def write_wanted_maps(job: MvsJob, view: int, depth: NDArray[np.float32], normal
         view: reference view.
         depth: (H, W) camera z; anything where unknown.
         normal: (H, W, 3) in the camera's frame, of unit length where known.
+
+    Raises:
+        MvsError: they aren't of the image's size.
+        OSError: they can't be written.
     """
     camera = job.views[view]
+    if depth.shape != (camera.height, camera.width) or normal.shape != (*depth.shape, 3):
+        sizes = f"{depth.shape[::-1]} and {normal.shape[1::-1]}"
+        raise MvsError(f"maps of {camera.name} have {sizes} pixels, its image ({camera.width}, {camera.height})")
     entry, leave = depth_range(camera, job.boxes_in_world, camera.width, camera.height)
     length = np.linalg.norm(normal, axis=-1)
     wanted = np.isfinite(depth) & (depth > 0) & (depth >= entry) & (depth <= leave) & (np.abs(length - 1) < 0.1)

@@ -71,3 +71,18 @@ def view_depth_range(job: MvsJob, view: int) -> tuple[float, float] | None:
         near = 0.5 * float(depths.min()) if len(depths) else 0.01 * far
     # A few rays stand for all.
     return (1 - _RANGE_MARGIN) * min(near, 0.5 * far), (1 + _RANGE_MARGIN) * far
+
+
+def usable_views(job: MvsJob) -> dict[int, tuple[int, ...]]:
+    """Views that can see the region and share something with another such view.
+
+    Returns:
+        Source views of each, best first, those that can't be used left out.
+    """
+    left = {view: s for view, s in enumerate(job.sources) if view_depth_range(job, view) is not None}
+    usable: dict[int, tuple[int, ...]] = {}
+    while left != usable:
+        usable = left
+        left = {view: tuple(source for source in sources if source in usable) for view, sources in usable.items()}
+        left = {view: sources for view, sources in left.items() if sources}
+    return usable

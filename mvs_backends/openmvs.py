@@ -59,10 +59,17 @@ class OpenMvs(MvsBackend):
         for name in ("images", "sparse"):
             (folder / name).symlink_to((job.workspace / name).absolute())
 
+        num_passes = 1 + _GEOMETRIC_PASSES[options.preset]
+        num_written = num_geometric = 0
+
         def count() -> None:
+            nonlocal num_written, num_geometric
             if progress is not None:
-                # Every pass writes all maps; more than half of the time is over when all are there.
-                progress(len(list(folder.glob("depth*.dmap"))) // 2, len(job.views))
+                # A geometric pass writes maps anew beside the old ones, and replaces these when all are there.
+                before, num_geometric = num_geometric, len(list(folder.glob("depth*.geo.dmap")))
+                num_written += max(num_geometric - before, 0)
+                num_first = len(list(folder.glob("depth*.dmap"))) - num_geometric
+                progress(min((num_first + num_written) // num_passes, len(job.views)), len(job.views))
 
         for program, arguments in zip(programs, _arguments(job, options, folder, num_threads), strict=True):
             assert program is not None, "checked above"
@@ -144,7 +151,7 @@ def read_dmap(path: Path) -> DepthData:
         depth = np.frombuffer(data, "<f4", width * height, offset).reshape(height, width)
         offset += depth.nbytes
         normal = np.frombuffer(data, "<f4", 3 * width * height, offset).reshape(height, width, 3)
-    except (OSError, struct.error, ValueError) as error:
+    except (OSError, struct.error, ValueError, OverflowError) as error:
         raise MvsError(f"{path} can't be read: {error}; see the log beside its folder") from error
     if magic != b"DR" or kind & (_DEPTH | _NORMAL) != _DEPTH | _NORMAL:
         raise MvsError(f"{path} holds no depth and normal map; see the log beside its folder")
@@ -155,10 +162,5 @@ def _check_camera(job: MvsJob, view: int, found: DepthData) -> None:
     centers = np.array([-camera.cam_from_world[:, :3].T @ camera.cam_from_world[:, 3] for camera in job.views])
     spacing = float(np.median(np.linalg.norm(centers - centers.mean(axis=0), axis=1)))
     camera = job.views[view]
-    if found.depth.shape != (camera.height, camera.width):
-        height, width = found.depth.shape
-        raise MvsError(
-            f"OpenMVS's map of {camera.name} has {width}x{height} pixels, its image {camera.width}x{camera.height}"
-        )
     if np.linalg.norm(found.center_in_world - centers[view]) > _MAX_CENTER_ERROR * max(spacing, 1e-6):
         raise MvsError(f"OpenMVS's map of {camera.name} was made with another pose")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import shlex
@@ -11,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from mvs_backends.base import MvsError
@@ -44,6 +45,7 @@ def run_subprocess(
     command: Sequence[str | Path],
     *,
     log_file: Path,
+    environment: Mapping[str, str] | None = None,
     timeout_s: float = 0.0,
     on_wait: Callable[[], None] | None = None,
 ) -> None:
@@ -52,6 +54,7 @@ def run_subprocess(
     Args:
         command: executable and arguments; no shell reads them.
         log_file: gets what it prints, after what is there.
+        environment: variables to set for it.
         timeout_s: it is killed when it runs longer; 0: never.
         on_wait: called a few times a second.
 
@@ -69,6 +72,7 @@ def run_subprocess(
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
+                env={**os.environ, **(environment or {})},
                 start_new_session=True,
                 preexec_fn=_die_with_parent,
             )
@@ -76,12 +80,11 @@ def run_subprocess(
             raise MvsError(f"{command[0]} can't be started: {error.strerror}; check the path") from error
     end = time.monotonic() + timeout_s if timeout_s > 0 else float("inf")
     try:
-        while process.poll() is None:
+        while not _ended(process):
             if time.monotonic() > end:
                 raise MvsError(f"{name} ran longer than {timeout_s:g} s and was stopped; {_last_lines(log_file)}")
             if on_wait is not None:
                 on_wait()
-            time.sleep(_POLL_S)
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
@@ -90,6 +93,12 @@ def run_subprocess(
         raise MvsError(f"{name} was ended by {signal.Signals(-process.returncode).name}; {_last_lines(log_file)}")
     if process.returncode > 0:
         raise MvsError(f"{name} ended with exit code {process.returncode}; {_last_lines(log_file)}")
+
+
+def _ended(process: subprocess.Popen[bytes]) -> bool:
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(_POLL_S)
+    return process.returncode is not None
 
 
 def _die_with_parent() -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from mvs_backends.base import MvsJob, MvsView
@@ -88,6 +89,30 @@ def plane_job(
         points_in_world=points,
         point_views=tuple(np.arange(num_points) for _ in views),
     )
+
+
+def write_model(job: MvsJob) -> None:
+    """Write the job's COLMAP model, and the folders for its maps, as `app.dense_job` does."""
+    model = pycolmap.Reconstruction()
+    tracks = [pycolmap.Track() for _ in job.points_in_world]
+    for number, (view, seen) in enumerate(zip(job.views, job.point_views, strict=True), start=1):
+        k = view.calibration
+        params = [k[0, 0], k[1, 1], k[0, 2], k[1, 2]]
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(camera_id=number, model="PINHOLE", width=view.width, height=view.height, params=params)
+        )
+        pixels = (job.points_in_world[seen] @ view.cam_from_world[:, :3].T + view.cam_from_world[:, 3]) @ k.T
+        image = pycolmap.Image(name=view.name, camera_id=number, image_id=number)
+        image.points2D = [pycolmap.Point2D(xy) for xy in pixels[:, :2] / pixels[:, 2:]]
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(view.cam_from_world))
+        for row, point in enumerate(seen):
+            tracks[point].add_element(number, row)
+        for path in (job.depth_map_path(number - 1), job.normal_map_path(number - 1)):
+            path.parent.mkdir(parents=True, exist_ok=True)
+    for point, track in zip(job.points_in_world, tracks, strict=True):
+        model.add_point3D(point, track)
+    (job.workspace / "sparse").mkdir()
+    model.write_binary(job.workspace / "sparse")
 
 
 def _points(view: MvsView, normal: NDArray[np.float64], offset: float) -> NDArray[np.float64]:

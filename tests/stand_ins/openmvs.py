@@ -1,67 +1,75 @@
-"""Stands in for OpenMVS's InterfaceCOLMAP and DensifyPointCloud, by its file name; answers with the true maps.
-
-The scene is the plane `PLANE = nx ny nz offset` of the environment. `FAULT` names what is to go wrong: exit, none,
-short or pose.
-"""
+"""Stands in for OpenMVS's InterfaceCOLMAP and DensifyPointCloud, by its file name; answers with the true maps."""
 
 from __future__ import annotations
 
-import os
 import struct
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 
+from tests.stand_ins.common import FAULT, PinholeImage, begin, check_pair, fail, write_result
 
-def fail(message: str) -> None:
-    """End with a message."""
-    print(message, flush=True)
-    sys.exit(1)
+
+def read_image(image: pycolmap.Image, source: Path, max_size: int) -> PinholeImage:
+    """Pixel centres are whole numbers."""
+    camera, pose = image.camera, image.cam_from_world()
+    grey = cv2.imread(str(source / "images" / image.name), cv2.IMREAD_GRAYSCALE)
+    if camera.model.name != "PINHOLE" or grey is None or grey.shape != (camera.height, camera.width):
+        fail(f"{image.name}: not undistorted, not there, or not of its camera's size")
+    if max(camera.width, camera.height) > max_size:
+        fail("images would be reduced")
+    calibration = camera.calibration_matrix()
+    calibration[:2, 2] -= 0.5
+    return PinholeImage(
+        grey=grey, calibration=calibration, rotation=pose.rotation.matrix(), translation=pose.translation, first_px=0.0
+    )
 
 
 def main() -> None:
     """Do what the program does."""
-    program, fault = Path(sys.argv[0]).name, os.environ.get("FAULT", "")
     arguments = dict(zip(sys.argv[1::2], sys.argv[2::2], strict=True))
     folder = Path(arguments["-w"])
-    if program == "InterfaceCOLMAP":
-        source = Path(arguments["--input-file"])
-        if (source / "stereo").exists():
-            fail("maps that are there would be imported")
-        if not (source / "sparse" / "cameras.bin").exists() or not arguments["--image-folder"].endswith("/"):
-            fail("no cameras, or an image folder without its slash")
-        (folder / arguments["--output-file"]).write_text(str(source), encoding="utf-8")
-        return
-    if fault == "exit":
-        fail("error: cannot load the scene")
+    if Path(sys.argv[0]).name == "InterfaceCOLMAP":
+        convert(folder, arguments)
+    else:
+        begin("error: cannot load the scene")
+        densify(folder, arguments)
+
+
+def convert(folder: Path, arguments: dict[str, str]) -> None:
+    """Remember where the model is."""
+    source = Path(arguments["--input-file"])
+    if (source / "stereo").exists():
+        fail("maps that are there would be imported")
+    if not (source / "sparse" / "cameras.bin").exists() or not arguments["--image-folder"].endswith("/"):
+        fail("no cameras, or an image folder without its slash")
+    (folder / arguments["--output-file"]).write_text(str(source), encoding="utf-8")
+
+
+def densify(folder: Path, arguments: dict[str, str]) -> None:
+    """Maps of all images that share points with another, the last image first."""
     source = Path((folder / arguments["--input-file"]).read_text(encoding="utf-8"))
     model = pycolmap.Reconstruction(source / "sparse")
-    plane = np.array([float(value) for value in os.environ["PLANE"].split()])
-    for number, image_id in enumerate(sorted(model.images, reverse=True)):
-        image, camera = model.image(image_id), model.image(image_id).camera
-        if camera.model.name != "PINHOLE" or not (source / "images" / image.name).exists():
-            fail(f"{image.name}: not undistorted, or not there")
-        if max(camera.width, camera.height) != int(arguments["--max-resolution"]):
-            fail("images would be reduced")
-        calibration = camera.calibration_matrix()
-        calibration[:2, 2] -= 0.5
-        pose, center = image.cam_from_world(), image.projection_center()
-        rotation = pose.rotation.matrix()
-        pixels = np.stack([*np.meshgrid(np.arange(camera.width), np.arange(camera.height))], axis=-1)
-        rays = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], axis=-1) @ np.linalg.inv(calibration).T
-        depth = (plane[3] - plane[:3] @ center) / (rays @ rotation @ plane[:3])
-        normal = np.broadcast_to(rotation @ -plane[:3], rays.shape)
-        name = f"images/{image.name}".encode()
-        size = camera.width, camera.height
+    seen = {
+        image_id: {p.point3D_id for p in image.points2D if p.has_point3D()} for image_id, image in model.images.items()
+    }
+    neighbours = {a: [b for b in seen if b != a and seen[a] & seen[b]] for a in sorted(seen, reverse=True)}
+    max_size = int(arguments["--max-resolution"])
+    images = {image_id: read_image(model.image(image_id), source, max_size) for image_id in seen}
+    used = [image_id for image_id, others in neighbours.items() if others]
+    for number, image_id in enumerate(used):
+        image = images[image_id]
+        for other in neighbours[image_id]:
+            check_pair(image, images[other])
+        depth = image.depth()
+        normal = np.broadcast_to(image.rotation @ image.normal_in_world(), (*depth.shape, 3))
+        name, size = f"images/{model.image(image_id).name}".encode(), depth.shape[::-1]
         data = struct.pack("<2sBxIIIIff", b"DR", 7, *size, *size, depth.min(), depth.max())
         data += struct.pack("<H", len(name)) + name + struct.pack("<3I", 2, image_id - 1, 0)
-        data += b"".join(a.astype("<f8").tobytes() for a in (calibration, rotation, center + (fault == "pose")))
-        data += depth.astype("<f4").tobytes() + normal.astype("<f4").tobytes() + np.ones_like(depth, "<f4").tobytes()
-        if fault != "none":
-            (folder / f"depth{number:04d}.dmap").write_bytes(data[: 5000 if fault == "short" else None])
-
-
-if __name__ == "__main__":
-    main()
+        center = image.center + (FAULT == "foreign")
+        data += b"".join(values.astype("<f8").tobytes() for values in (image.calibration, image.rotation, center))
+        data += b"".join(values.astype("<f4").tobytes() for values in (depth, normal, np.ones_like(depth)))
+        write_result(folder / f"depth{number:04d}.dmap", data, is_last=number == len(used) - 1)

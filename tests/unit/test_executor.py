@@ -47,6 +47,29 @@ def test_each_end_of_a_job_is_reported(tmp_path: Path) -> None:
     assert "KeyError: 'oops'" in (tmp_path / "log").read_text(), "a bug's traceback is in the log file"
 
 
+def write_gpu(output: Path, report) -> None:  # type: ignore[no-untyped-def]
+    output.write_text(os.environ["CUDA_VISIBLE_DEVICES"])
+    while len(list(output.parent.glob("job*"))) < 2:
+        time.sleep(0.02)
+
+
+def test_each_job_has_a_gpu_of_its_own(tmp_path: Path) -> None:
+    """Two at a time, each waiting for the other, then a third."""
+    run_jobs(
+        write_gpu,
+        {name: (tmp_path / name,) for name in ("job1", "job2", "job3")},
+        num_workers=2,
+        log_file=tmp_path / "log",
+        on_progress=lambda name, done, total: None,
+        on_done=lambda name, reason: None,
+        environments=[{"CUDA_VISIBLE_DEVICES": "3"}, {"CUDA_VISIBLE_DEVICES": "5"}],
+    )
+    gpus = [(tmp_path / name).read_text() for name in ("job1", "job2", "job3")]
+    assert sorted(gpus[:2]) == ["3", "5"]
+    assert gpus[2] in ("3", "5")
+    assert "CUDA_VISIBLE_DEVICES" not in os.environ
+
+
 def wait_forever(pid_file: Path, report) -> None:  # type: ignore[no-untyped-def]
     pid_file.write_text(str(os.getpid()))
     time.sleep(600)

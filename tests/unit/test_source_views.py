@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from mvs_backends.base import MvsView
+from mvs_backends.depth_range import usable_views
 from mvs_backends.source_views import choose_source_views
+from tests.reference.plane_scene import plane_job
 
 CALIBRATION = np.array([[100.0, 0, 50], [0, 100.0, 40], [0, 0, 1]])
 
@@ -74,3 +79,15 @@ def test_order_of_points_does_not_matter() -> None:
 
 def test_nothing_to_share_gives_no_sources() -> None:
     assert choose([view_at(0), view_at(1)], points=False, samples=False) == ((), ())
+
+
+def test_views_that_cannot_be_used_are_no_sources_either(tmp_path: Path) -> None:
+    """View 3 looks away from the region, so view 2, which has no other source, is of no use, nor is it to view 1."""
+    job = plane_job(tmp_path / "job", normal=(0.0, 0.0, 1.0))
+    away = job.views[3].cam_from_world * np.array([[-1.0], [1.0], [-1.0]])
+    job = replace(
+        job,
+        views=(*job.views[:3], replace(job.views[3], cam_from_world=away)),
+        sources=((1, 3), (3, 2, 0), (3,), (0, 1)),
+    )
+    assert usable_views(job) == {0: (1,), 1: (0,)}
