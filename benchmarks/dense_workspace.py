@@ -10,6 +10,7 @@ import pycolmap
 
 from app.dense_job import prepare_workspace, write_dense_job
 from app.options import DensifyOptions
+from app.scene.point_index import PointIndex
 from app.scene.read_model import read_posed_scene
 from fusion.region import GroundRegion
 from mvs_backends.base import MvsJob
@@ -44,6 +45,14 @@ def make_workspace(
     reconstruction = pycolmap.Reconstruction(str(model))
     cameras = [reconstruction.cameras[camera_id] for camera_id in sorted(reconstruction.cameras)]
     job = folder / f"job{side_m:g}"
-    write_dense_job(job, scene=scene, image_rows=rows, region=region, cameras=cameras, digests={})
+    write_dense_job(
+        job,
+        scene=scene,
+        points=PointIndex(scene.points_in_world),
+        image_rows=np.array(rows),
+        region=region,
+        cameras=cameras,
+        digests={},
+    )
     options = DensifyOptions(max_image_size_px=max_image_size_px)
     return prepare_workspace(job, folder / "workspace", image_root=images, mask_root=None, options=options)
