@@ -46,7 +46,7 @@ def _at(clustering: Clustering, x: float, y: float) -> list[str]:
 
 
 def test_walls_in_front_are_clusters_and_the_rest_is_dropped_with_a_reason() -> None:
-    clustering = cluster_views(_street(), ClusteringOptions())
+    clustering = cluster_views(_street(), ClusteringOptions(max_camera_distance_m=40))
     assert len(clustering.clusters) == 2
     a, b = _at(clustering, 28, 5), _at(clustering, 28, 25)
     assert len(a) == len(b) == 1
@@ -72,7 +72,7 @@ def test_images_join_by_view_and_by_distance_from_the_block_centre() -> None:
         "far.jpg": level_camera([-11, 10, 1.5], 0),
         "away.jpg": level_camera([5, 10, 1.5], 180),
     }
-    options = ClusteringOptions(min_cameras_per_cluster=1)
+    options = ClusteringOptions(min_cameras_per_cluster=1, max_camera_distance_m=40)
     clustering = cluster_views(make_scene(cameras, _patch(30, 10)), options)
     assert [c.image_names for c in clustering.clusters] == [("edge.jpg", "near.jpg")]
 
