@@ -121,9 +121,10 @@ def densify_stage(run: Run, *, jobs: Mapping[str, Path], folder: Path, num_jobs:
     check_backend(run)
     inventory = Inventory.read(run.workspace.inventory_file)
     densify = _densify(run)
+    backend = get_backend(densify.backend)
     environments: list[dict[str, str]] = []
     stereo = run.config.stereo
-    if get_backend(densify.backend).uses_gpu:
+    if backend.uses_gpu:
         num_sharers = min(len(jobs), num_jobs or len(jobs))
         environments = [gpu_environment(gpus) for gpus in deal_gpus(chosen_gpus(stereo.gpu_index), num_sharers)]
         stereo = replace(stereo, gpu_index="-1")
@@ -154,6 +155,7 @@ def densify_stage(run: Run, *, jobs: Mapping[str, Path], folder: Path, num_jobs:
         num_workers=num_workers,
         log_file=run.workspace.log_file,
         environments=environments,
+        prepare=backend.prepare,
     )
 
 

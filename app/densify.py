@@ -119,8 +119,9 @@ def run_tasks(
     num_workers: int,
     log_file: Path,
     environments: Sequence[Mapping[str, str]] = (),
+    prepare: Callable[[], None] | None = None,
 ) -> dict[str, str]:
-    """Run the tasks whose folders aren't up to date, in processes of their own (see `run_jobs`).
+    """Run the tasks whose folders aren't up to date, in processes of their own (see `run_jobs`), after ``prepare()``.
 
     Returns:
         Reason of failure by task name; empty if all succeeded.
@@ -130,6 +131,8 @@ def run_tasks(
         logger.info("%s: %d of %d already done", label, len(tasks) - len(todo), len(tasks))
     if not todo:
         return {}
+    if prepare is not None:
+        prepare()
     steps: Counter[str] = Counter()
     total = sum(task.num_steps for task in todo.values())
     line = ProgressLine(label)

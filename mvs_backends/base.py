@@ -136,6 +136,9 @@ class MvsBackend(ABC):
     def availability(self, options: MvsOptions) -> Availability:
         """Whether this back-end can run on this machine."""
 
+    def prepare(self) -> None:  # noqa: B027
+        """Do once what parallel jobs would else all do at their start. Nothing by default."""
+
     @abstractmethod
     def estimate(self, *, job: MvsJob, options: MvsOptions, num_threads: int, progress: Progress | None = None) -> None:
         """Leave one depth map and one normal map per reference view at the job's paths.

@@ -6,6 +6,7 @@ import hashlib
 import json
 import logging
 import shutil
+import tempfile
 import time
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import asdict
@@ -33,6 +34,7 @@ from mvs_backends.patchmatch.search import (
     upsampled,
     window,
 )
+from mvs_backends.patchmatch.tiny_job import tiny_job
 
 logger = logging.getLogger(__name__)
 
@@ -43,6 +45,17 @@ class PatchMatch(MvsBackend):
     def availability(self, options: MvsOptions) -> Availability:
         """Always: it needs nothing but this package."""
         return Availability(ok=True, reason="built in, runs on the CPU")
+
+    def prepare(self) -> None:
+        """Compile the kernels, unless this machine has kept them."""
+        kept = Path(sweep_rows.stats.cache_path)
+        if any(kept.glob("kernels.sweep_rows-*.nbi")):
+            return
+        logger.info("compiling the stereo kernels for this machine, once (less than a minute)")
+        logger.debug("compiled kernels are kept in %s", kept)
+        with tempfile.TemporaryDirectory() as folder:
+            options = options_of_preset(MvsOptions())
+            estimate_maps(job=tiny_job(Path(folder)), options=options, seed=0, num_threads=1)
 
     def estimate(self, *, job: MvsJob, options: MvsOptions, num_threads: int, progress: Progress | None = None) -> None:
         """See `MvsBackend.estimate`."""
@@ -68,7 +81,6 @@ def estimate_maps(
     """
     if all(has_maps(job, view) for view in range(len(job.views))):
         return
-    _announce_compilation()
     num_levels = len(options.iterations)
     total = num_levels * len(job.views)
     folder = _kept_folder(job, options, seed)
@@ -95,12 +107,6 @@ def estimate_maps(
                 if progress is not None:
                     progress((number * len(job.views) + view + 1) * len(job.views) // total, len(job.views))
     shutil.rmtree(folder)
-
-
-def _announce_compilation() -> None:
-    compiled = Path(sweep_rows.stats.cache_path)
-    if not any(compiled.glob("kernels.sweep_rows-*.nbi")):
-        logger.info("compiling kernels, once (about 20 seconds); kept in %s", compiled)
 
 
 def _search_view(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -19,6 +21,7 @@ from mvs_backends.patchmatch.options import PatchMatchOptions
 from tests.reference.colmap_maps import read_map
 from tests.reference.plane_scene import plane_job, true_depth
 
+ROOT = Path(__file__).resolve().parents[2]
 OPTIONS = MvsOptions()
 SLANTED = (0.35, -0.3, 1.0)
 QUICK = PatchMatchOptions(num_source_views=3, max_cost_views=3, iterations=(3, 1), prior_iterations=1, num_random=4)
@@ -209,3 +212,28 @@ def test_every_preset_fills_whole_size_maps(tmp_path: Path, preset: Preset) -> N
 def test_invalid_options_name_the_field(field: str) -> None:
     with pytest.raises(ValueError, match=field):
         dataclasses.replace(PatchMatchOptions(), **{field: () if field == "iterations" else 0})
+
+
+def test_the_tiny_job_compiles_every_kernel(tmp_path: Path) -> None:
+    """In a process that has used none yet: what a job needs beyond it, each of many jobs would compile for itself."""
+    script = f"""
+from pathlib import Path
+from numba.core.registry import CPUDispatcher
+import mvs_backends.patchmatch.cost.kernels as cost
+import mvs_backends.patchmatch.kernels as search
+import mvs_backends.patchmatch.maps.kernels as maps
+from mvs_backends.patchmatch.tiny_job import tiny_job
+from tests.unit.test_patchmatch import MvsOptions, SLANTED, plane_job, run
+kernels = {{
+    kernel for module in (cost, search, maps) for kernel in vars(module).values() if isinstance(kernel, CPUDispatcher)
+}}
+run(tiny_job(Path({str(tmp_path)!r}) / "tiny"))
+compiled = {{kernel: set(kernel.signatures) for kernel in kernels}}
+assert search.sweep_rows.signatures
+for preset in ("preview", "normal"):
+    job = plane_job(Path({str(tmp_path)!r}) / preset, normal=SLANTED, num_views=3)
+    run(job, options=MvsOptions(preset=preset))
+assert {{kernel: set(kernel.signatures) for kernel in kernels}} == compiled
+"""
+    result = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True, cwd=ROOT)
+    assert result.returncode == 0, result.stderr
