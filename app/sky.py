@@ -29,6 +29,8 @@ def find_sky(
 ) -> NDArray[np.bool_]:
     """Smooth, bright, not reddish areas above the horizon that reach the image's upper border and hold no keypoints.
 
+    The upper border is the one that is up in the world: cameras may be held upright.
+
     Args:
         image: (H, W, 3) blue, green, red.
         calibration: (3, 3) K in pixels.
@@ -53,12 +55,23 @@ def find_sky(
     inside = (row >= 0) & (row < labels.shape[0]) & (column >= 0) & (column < labels.shape[1])
     keypoints = np.bincount(labels[row[inside], column[inside]], minlength=count)
     area = statistics[:, cv2.CC_STAT_AREA]
-    is_sky = (statistics[:, cv2.CC_STAT_TOP] == 0) & (area >= _MIN_AREA * labels.size)
+    is_sky = _at_upper_border(statistics, labels.shape, cam_from_world) & (area >= _MIN_AREA * labels.size)
     is_sky &= keypoints <= area / _PIXELS_PER_KEYPOINT
     is_sky[0] = False
     grown = cv2.dilate(is_sky[labels].astype(np.uint8), np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8))
     sky: NDArray[np.bool_] = cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST).astype(np.bool_)
     return sky
+
+
+def _at_upper_border(
+    statistics: NDArray[np.int32], shape: tuple[int, ...], cam_from_world: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """(L,) whether a connected area reaches that border of the image which is up."""
+    left, top, width, height = statistics[:, :4].T
+    right, down, _ = cam_from_world[:, 2]
+    borders = {-down: top == 0, -right: left == 0, down: top + height == shape[0], right: left + width == shape[1]}
+    reached: NDArray[np.bool_] = borders[max(borders)]
+    return reached
 
 
 def _above_horizon(

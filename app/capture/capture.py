@@ -149,7 +149,13 @@ def capture(
 
 def _images(probes: Mapping[str, ImageProbe], masks: Mapping[str, str]) -> tuple[ImageEntry, ...]:
     return tuple(
-        ImageEntry(name=name, size_bytes=probe.size_bytes, digest=probe.digest, mask_digest=masks.get(name, ""))
+        ImageEntry(
+            name=name,
+            size_bytes=probe.size_bytes,
+            digest=probe.digest,
+            mask_digest=masks.get(name, ""),
+            quarter_turns=probe.quarter_turns,
+        )
         for name, probe in sorted(probes.items())
     )
 

@@ -1,4 +1,4 @@
-"""GPS position from the EXIF block of a JPEG file.
+"""GPS position and orientation from the EXIF block of a JPEG file.
 
 COLMAP's reader decodes the whole image to get at its EXIF data, some 50 times slower; it is used for focal lengths
 (one image per camera), not for positions (all images).
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import struct
 
+_ORIENTATION_TAG = 0x0112
 _GPS_IFD_TAG = 0x8825
 _LAT_REF, _LAT, _LON_REF, _LON, _ALT_REF, _ALT = range(1, 7)
 _TYPE_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8}
@@ -25,11 +26,8 @@ def gps_from_exif(tiff: bytes) -> tuple[float, float, float] | None:
         Latitude and longitude in degrees and height in metres (NaN if there is none), or None where there is no
         valid position. (0, 0) is what cameras write without a fix, and counts as none.
     """
-    order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
-    if order is None:
-        return None
     try:
-        root = _read_ifd(tiff, order, struct.unpack_from(order + "I", tiff, 4)[0])
+        order, root = _read_root(tiff)
         if _GPS_IFD_TAG not in root:
             return None
         gps = _read_ifd(tiff, order, struct.unpack(order + "I", root[_GPS_IFD_TAG][1][:4])[0])
@@ -45,6 +43,27 @@ def gps_from_exif(tiff: bytes) -> tuple[float, float, float] | None:
     if abs(lat) > 90.0 or abs(lon) > 180.0 or (lat == 0.0 and lon == 0.0):
         return None
     return lat, lon, height
+
+
+def quarter_turns_from_exif(tiff: bytes) -> int:
+    """Clockwise quarter turns, 0 to 3, that show the pixels as stored upright; 0 where the block doesn't say.
+
+    Mirrored orientations, which cameras don't write, count as 0.
+    """
+    try:
+        order, root = _read_root(tiff)
+        (value,) = struct.unpack(order + "H", root[_ORIENTATION_TAG][1][:2])
+    except (struct.error, KeyError):
+        return 0
+    return {6: 1, 3: 2, 8: 3}.get(value, 0)
+
+
+def _read_root(tiff: bytes) -> tuple[str, dict[int, tuple[int, bytes]]]:
+    """Byte order and first directory; an empty one if the block isn't EXIF."""
+    order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
+    if order is None:
+        return "<", {}
+    return order, _read_ifd(tiff, order, struct.unpack_from(order + "I", tiff, 4)[0])
 
 
 def _read_ifd(tiff: bytes, order: str, offset: int) -> dict[int, tuple[int, bytes]]:

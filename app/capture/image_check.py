@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from app.capture.exif import gps_from_exif
+from app.capture.exif import gps_from_exif, quarter_turns_from_exif
 from app.errors import InputError
 
 _BATCH = 256
@@ -30,6 +30,8 @@ class ImageProbe:
     has_exif: bool
     gps: tuple[float, float, float] | None
     """As in `gps_from_exif`."""
+    quarter_turns: int
+    """As in `quarter_turns_from_exif`."""
 
 
 class _BadImageError(Exception):
@@ -118,7 +120,8 @@ def _probe_image(path: Path) -> ImageProbe:
         size_bytes=len(data),
         digest=image_digest(data),
         has_exif=bool(exif),
-        gps=gps_from_exif(exif) if exif else None,
+        gps=gps_from_exif(exif),
+        quarter_turns=quarter_turns_from_exif(exif),
     )
 
 

@@ -50,6 +50,8 @@ class ImageEntry:
     """Hash of the file."""
     mask_digest: str = ""
     """Hash of the mask `mask_root/NAME.png`; empty when there is none."""
+    quarter_turns: int = 0
+    """Clockwise, to show it upright (EXIF orientation). Pixels are used as stored; this says where up is in them."""
 
     @property
     def has_mask(self) -> bool:

@@ -26,6 +26,8 @@ class ModelFrames:
     """(F, 3) centre of the frame's reference camera."""
     right_in_model: NDArray[np.float64] | None
     """(F, 3) x axis of the frame's reference camera; None where frames come from several cameras that are no rig."""
+    upright_from_world: NDArray[np.float64]
+    """(N, 3, 3) rotations of the scene's images as they are looked at: turned as EXIF says, so that y points down."""
     image_frames: NDArray[np.int64]
     """(N,) frame of each of the scene's images; -1 for images that the inventory doesn't have."""
     image_cameras: NDArray[np.int64]
@@ -73,19 +75,38 @@ def model_frames(scene: PosedScene, inventory: Inventory | None) -> ModelFrames:
     cameras = tuple(sorted(set(names), key=natural_key))
     index_of = {camera: index for index, camera in enumerate(cameras)}
     image_cameras = np.array([index_of[name] for name in names], dtype=np.int64)
-    positions, right = _reference_cameras(scene, image_frames, image_cameras, len(kept), is_rig)
+    turns = {image.name: image.quarter_turns for image in inventory.images} if inventory is not None else {}
+    upright = turned_upright(
+        scene.cam_from_world[:, :, :3], np.array([turns.get(name, 0) for name in scene.image_names], dtype=np.int64)
+    )
+    positions, right = _reference_cameras(scene, upright, image_frames, image_cameras, len(kept), is_rig)
     return ModelFrames(
         frames=tuple(kept),
         positions_in_model=positions,
         right_in_model=right if is_rig or len(cameras) == 1 else None,
+        upright_from_world=upright,
         image_frames=image_frames,
         image_cameras=image_cameras,
         cameras=cameras,
     )
 
 
+def turned_upright(rotations: NDArray[np.float64], quarter_turns: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(N, 3, 3) rotations of cameras whose images are turned clockwise by (N,) quarter turns.
+
+    What was right in the stored image is down after one turn, and what was up is right.
+    """
+    x, y = rotations[:, 0], rotations[:, 1]
+    turned = rotations.copy()
+    for turns, (right, down) in {1: (-y, x), 2: (-x, -y), 3: (y, -x)}.items():
+        chosen = quarter_turns == turns
+        turned[chosen, 0], turned[chosen, 1] = right[chosen], down[chosen]
+    return turned
+
+
 def _reference_cameras(
     scene: PosedScene,
+    upright_from_world: NDArray[np.float64],
     image_frames: NDArray[np.int64],
     image_cameras: NDArray[np.int64],
     num_frames: int,
@@ -110,7 +131,7 @@ def _reference_cameras(
     for camera in order:
         here = row[camera] >= 0
         rows = row[camera, here]
-        estimate, axes = centers[rows], rotations[rows, 0, :]
+        estimate, axes = centers[rows], upright_from_world[rows, 0, :]
         both = here & np.isfinite(positions[:, 0])
         if is_rig and both.any():
             shared = row[camera, both]

@@ -210,7 +210,7 @@ def _find_up(scene: PosedScene, frames: ModelFrames, gps: _Gps | None, options: 
         ground = find_ground(scene, up, seed=options.seed)
         return _Up(direction=up, sigma_deg=0.0, source=GravitySource.MODEL, ground=ground)
     overruled = _up_from_gps_alone(frames, gps, options)
-    cameras = up_from_cameras(scene.cam_from_world[:, :, :3], frames.image_cameras)
+    cameras = up_from_cameras(frames.upright_from_world, frames.image_cameras)
     source = GravitySource.CAMERAS
     if cameras is not None:
         up, term = cameras

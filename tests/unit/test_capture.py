@@ -287,6 +287,23 @@ def test_exif_position_agrees_with_colmaps_reader(
     assert found == pytest.approx((bitmap.exif_latitude(), bitmap.exif_longitude(), bitmap.exif_altitude()), abs=1e-6)
 
 
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_exif_orientation_agrees_with_opencvs_reader(tmp_path: Path, order: str, orientation: int) -> None:
+    tiff = (b"II" if order == "<" else b"MM") + struct.pack(order + "HI", 42, 8)
+    tiff += struct.pack(order + "HHHIHHI", 1, 0x0112, 3, 1, orientation, 0, 0)
+    for name in ("1.jpg", "2.jpg"):
+        path = tmp_path / "images" / name
+        write_image(path)
+        data = path.read_bytes()
+        path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(tiff) + 8) + b"Exif\0\0" + tiff + data[2:])
+    inventory = take(tmp_path)
+    turns = inventory.images[0].quarter_turns
+    stored = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    np.testing.assert_array_equal(np.rot90(stored, -turns), cv2.imread(str(path), cv2.IMREAD_COLOR))
+    assert ("upright or upside down by EXIF: all 2 images" in describe(inventory)) == (orientation != 1)
+
+
 def test_a_gps_file_takes_the_place_of_exif(tmp_path: Path) -> None:
     for name in ("1.jpg", "2.jpg"):
         exif_jpeg(tmp_path / "images" / name, "<", 10.0, 20.0, 30.0)

@@ -204,6 +204,21 @@ def test_cameras_that_look_around_tell_up_without_the_ground() -> None:
     assert np.degrees(np.arccos(found[0][2])) < 0.7
 
 
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_images_that_are_stored_turned(tmp_path: Path, turns: int) -> None:
+    """Held upright, as phones are: what is down in the world is right, up or left in the stored image."""
+    truth = drive(pitch_deg=4.0)
+    right, down = truth.rotations[:, :, 0].copy(), truth.rotations[:, :, 1].copy()
+    stored = truth.rotations.copy()
+    stored[:, :, 0], stored[:, :, 1] = {1: (down, -right), 2: (-right, -down), 3: (-down, right)}[turns]
+    turned = replace(truth, rotations=stored)
+    captured = inventory(turned)
+    images = tuple(replace(image, quarter_turns=turns) for image in captured.images)
+    found, model = run(tmp_path, turned, replace(captured, images=images))
+    assert tilt_deg(turned, model) < 1.0
+    assert found.gravity_source is GravitySource.CAMERAS_AND_GROUND
+
+
 def test_the_ground_tells_the_pitch_of_a_single_camera(tmp_path: Path) -> None:
     truth = drive(40, corner=False, pitch_deg=10.0)
     write_model(truth, tmp_path / "sfm", random_similarity(3), cameras=(0,))

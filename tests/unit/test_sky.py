@@ -52,6 +52,18 @@ def test_an_area_with_keypoints_is_a_wall() -> None:
     assert not sky[:, 175:].any()
 
 
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_the_upper_border_of_a_camera_held_upright(turns: int) -> None:
+    """The picture turned counterclockwise, as a camera stores it that was turned clockwise."""
+    pose, calibration = CAM_FROM_WORLD, K
+    for width in (320, 200, 320)[:turns]:
+        pose = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]) @ pose
+        calibration = np.array([[200.0, 0, calibration[1, 2]], [0, 200, width - calibration[0, 2]], [0, 0, 1]])
+    image = np.ascontiguousarray(np.rot90(picture(), turns))
+    sky = find_sky(image, calibration=calibration, cam_from_world=pose, keypoints_px=np.empty((0, 2)))
+    np.testing.assert_array_equal(np.rot90(sky, -turns), sky_of(picture(), []))
+
+
 def test_what_is_below_the_horizon_or_away_from_the_border_or_reddish_is_not_sky() -> None:
     upside_down = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0]])
     assert not find_sky(picture(), calibration=K, cam_from_world=upside_down, keypoints_px=np.empty((0, 2)))[:90].any()
