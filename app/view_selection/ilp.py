@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -79,21 +81,24 @@ def greedy_selection(program: ViewProgram, preference: NDArray[np.float64]) -> N
         (N_c,)
     """
     order = np.lexsort((np.arange(len(preference)), -preference))
-    rank = np.empty(len(order), dtype=np.int64)
-    rank[order] = np.arange(len(order))
     selected = program.fixed.copy()
+    lacking = program.rows.bounds - program.views_of_rows[:, selected].sum(axis=1)
+    matched = program.matches[:, selected].sum(axis=1)
     while True:
-        uncovered, unmatched = program.missing(selected)
-        if uncovered.any():
-            gain = program.views_of_rows[uncovered > 0].sum(axis=0)
+        unmatched = selected & (matched < program.n_match)
+        if np.any(lacking > 0):
+            gain = program.views_of_rows[lacking > 0].sum(axis=0)
         elif unmatched.any():
-            gain = program.matches[unmatched > 0].sum(axis=0)
+            gain = program.matches[unmatched].sum(axis=0)
         elif selected.sum() < program.min_views:
             gain = np.ones(len(selected), dtype=np.int64)
         else:
             break
         gain = np.where(program.usable & ~selected, gain, 0)
-        selected[np.lexsort((rank, -gain))[0]] = True
+        best = order[np.argmax(gain[order])]
+        selected[best] = True
+        lacking -= program.views_of_rows[:, best]
+        matched += program.matches[best]
     for view in order[::-1]:
         if selected.sum() <= program.min_views:
             break
@@ -164,13 +169,11 @@ class _Model:
         self._variables = [mip.Variable(self._helper, index) for index in range(len(lower))]
 
     def constrain(
-        self, variables: NDArray[np.integer], coefficients: NDArray[np.float64], lower: float, upper: float = np.inf
+        self, variables: Sequence[int], coefficients: Sequence[float], lower: float, upper: float = math.inf
     ) -> None:
         """Bound a linear expression."""
         row = self._helper.add_linear_constraint()
-        self._helper.add_terms_to_constraint(
-            row, [self._variables[index] for index in variables.tolist()], coefficients.tolist()
-        )
+        self._helper.add_terms_to_constraint(row, [self._variables[index] for index in variables], list(coefficients))
         self._helper.set_constraint_lower_bound(row, lower)
         self._helper.set_constraint_upper_bound(row, upper)
 
@@ -197,8 +200,8 @@ class _Model:
 
 def _size_model(program: ViewProgram) -> _Model:
     model = _Model(program.fixed.astype(np.float64), program.usable.astype(np.float64), len(program.usable))
-    views = np.flatnonzero(program.usable)
-    model.constrain(views, np.ones(len(views)), program.min_views)
+    views = np.flatnonzero(program.usable).tolist()
+    model.constrain(views, [1.0] * len(views), program.min_views)
     model.optimize(np.ones(len(program.usable)), maximize=False)
     return model
 
@@ -215,12 +218,13 @@ def _quality_model(program: ViewProgram, worth: ViewQuality, size: int) -> _Mode
     model = _Model(lower, upper, num_views)
     counts = np.arange(num_views)
     counts[shared] = num_views + np.arange(len(shared))
-    for view in shared:
-        model.constrain(np.array([view, counts[view]]), np.array([1.0, -1.0]), 0.0)
-    for number in np.unique(viewpoint[shared]):
-        group = counts[shared[viewpoint[shared] == number]]
-        model.constrain(group, np.ones(len(group)), 0.0, 1.0)
-    model.constrain(views, np.ones(len(views)), size, size)
+    groups: dict[int, list[int]] = {}
+    for view, count, number in zip(shared.tolist(), counts[shared].tolist(), viewpoint[shared].tolist(), strict=True):
+        model.constrain((view, count), (1.0, -1.0), 0.0)
+        groups.setdefault(number, []).append(count)
+    for group in groups.values():
+        model.constrain(group, [1.0] * len(group), 0.0, 1.0)
+    model.constrain(views.tolist(), [1.0] * len(views), size, size)
     objective = np.zeros(len(lower))
     objective[counts[views]] = worth.quality[views]
     model.optimize(objective, maximize=True)
@@ -230,22 +234,20 @@ def _quality_model(program: ViewProgram, worth: ViewQuality, size: int) -> _Mode
 def _solve(model: _Model, program: ViewProgram, max_nodes: int) -> tuple[NDArray[np.bool_] | None, float]:
     """The best selection that the solver finds, if any, and its bound on the objective.
 
-    Constraints are many and few of them active, so each joins the model once a solution without it violates it; the
-    result is the same.
+    Matching constraints are many, dense and seldom active, so a view's joins the model once a solution without it
+    violates it; the result is the same.
     """
-    seeing, usable = program.views_of_rows, program.usable
+    for row, bound in zip(program.views_of_rows, program.rows.bounds.tolist(), strict=True):
+        views = np.flatnonzero(row).tolist()
+        model.constrain(views, [1.0] * len(views), bound)
     while True:
-        values, bound = model.solve(max_nodes)
+        values, objective_bound = model.solve(max_nodes)
         if values is None:
-            return None, bound
-        selected = values[: len(usable)] > 0.5
-        uncovered, unmatched = program.missing(selected)
-        if not uncovered.any() and not unmatched.any():
-            return selected if program.is_met_by(selected) else None, bound
-        for row in np.flatnonzero(uncovered):
-            views = np.flatnonzero(seeing[row])
-            model.constrain(views, np.ones(len(views)), float(program.rows.bounds[row]))
-        for view in np.flatnonzero(unmatched):
-            partners = np.flatnonzero(program.matches[view] & usable)
-            weights = np.append(np.ones(len(partners)), -float(program.n_match))
-            model.constrain(np.append(partners, view), weights, 0.0)
+            return None, objective_bound
+        selected = values[: len(program.usable)] > 0.5
+        unmatched = np.flatnonzero(program.missing(selected)[1]).tolist()
+        if not unmatched:
+            return selected if program.is_met_by(selected) else None, objective_bound
+        for view in unmatched:
+            partners = np.flatnonzero(program.matches[view] & program.usable).tolist()
+            model.constrain([*partners, view], [*[1.0] * len(partners), -float(program.n_match)], 0.0)

@@ -131,7 +131,7 @@ def _select_in_worker(batch: range, options: SelectionOptions) -> list[Selection
 def _solved(reader: _ClusterReader, options: SelectionOptions, num_workers: int) -> Iterator[Selection]:
     """Selections in the order of the clusters, with few of them in memory.
 
-    This process works too, on what no worker has begun: those need a while to start.
+    This process does what no worker has begun: they need a while to start.
     """
     total = len(reader.clusters)
     batches = iter([range(first, min(first + _BATCH, total)) for first in range(0, total, _BATCH)])
@@ -140,7 +140,7 @@ def _solved(reader: _ClusterReader, options: SelectionOptions, num_workers: int)
             yield from reader.select(batch, options)
         return
     with ProcessPoolExecutor(
-        num_workers - 1,
+        num_workers,
         multiprocessing.get_context("spawn"),
         initializer=_start_worker,
         initargs=(os.getpid(), reader.folder),
