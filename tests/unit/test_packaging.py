@@ -3,6 +3,8 @@
 import ast
 import re
 import shlex
+import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator
 from functools import cache
@@ -162,3 +164,8 @@ def test_the_links_of_the_readme_lead_somewhere() -> None:
     links = [target for target in re.findall(r"\]\(([^)]+)\)", README) if not target.startswith("https://")]
     assert links
     assert [target for target in links if not (ROOT / target).exists()] == []
+
+
+def test_png_files_can_be_written_where_pycolmap_is_imported_before_opencv() -> None:
+    script = "import app, pycolmap, cv2, numpy; cv2.imencode('.png', numpy.zeros((500, 500, 3), numpy.uint8))"
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT)
