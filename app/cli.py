@@ -217,14 +217,17 @@ def explain(
     clusters: Annotated[
         list[str] | None, typer.Argument(metavar="[CLUSTER]...", help="Clusters to explain. Default: a table of all.")
     ] = None,
+    pictures: Annotated[
+        bool, typer.Option("--pictures", help="Draw all clusters; those named are drawn anyway.")
+    ] = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Say why each view of a cluster was selected, what was relaxed, and what is covered before and after."""
+    """Say why each view of a cluster was selected, what was relaxed, and what is covered, and draw it."""
     from app.explain import explain as explain_clusters
     from app.workspace import Workspace
 
     def work() -> None:
-        for line in explain_clusters(Workspace(workspace.absolute()), clusters or []):
+        for line in explain_clusters(Workspace(workspace.absolute()), clusters or [], draw_all=pictures):
             typer.echo(line)
 
     run_safely(work, verbosity=int(verbose))

@@ -3,23 +3,31 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 
+from app.clustering.clusters import Cluster, Clustering
 from app.errors import InputError
+from app.scene.read_model import open_scene
 from app.stage import finished_product
+from app.stages import map_labels
 from app.view_selection.describe import describe_selection, tabulate_selections
+from app.view_selection.picture import write_pictures
+from app.view_selection.problem import ProblemCutter
 from app.view_selection.selection import Selection, read_selections
+from app.view_selection.stage import PICTURES_FOLDER
 from app.workspace import Workspace
 
 
-def explain(workspace: Workspace, clusters: Sequence[str]) -> Iterable[str]:
-    """Explain the selection of some clusters at length, or of all in a table.
+def explain(workspace: Workspace, names: Sequence[str], *, draw_all: bool = False) -> Iterator[str]:
+    """Explain the selection of some clusters at length and draw them, or tabulate all.
 
     Args:
-        workspace: With selected views.
-        clusters: Names; none for the table.
+        workspace: With selected views. Pictures go to ``selection/pictures/CLUSTER.png``.
+        names: Of clusters; none for the table.
+        draw_all: Draw every cluster of the table.
 
-    Returns:
+    Yields:
         Lines.
 
     Raises:
@@ -27,16 +35,33 @@ def explain(workspace: Workspace, clusters: Sequence[str]) -> Iterable[str]:
     """
     folder = workspace.root / "selection"
     finished_product(folder, "select")
-    selections = read_selections(folder)
-    if not clusters:
-        return tabulate_selections(selections)
-    return [describe_selection(selection) for selection in _named(selections, clusters)]
+    clusters = Clustering.read(workspace.root / "clusters").clusters
+    if not names:
+        yield from tabulate_selections(read_selections(folder))
+        if draw_all:
+            yield _draw(workspace, zip(clusters, read_selections(folder), strict=True))
+        return
+    numbers, selections = _named(folder, names)
+    where = _draw(workspace, ((clusters[numbers[name]], selections[name]) for name in names))
+    yield from (describe_selection(selections[name]) for name in names)
+    yield where
 
 
-def _named(selections: Iterable[Selection], wanted: Sequence[str]) -> list[Selection]:
-    by_name = {selection.cluster: selection for selection in selections}
-    for name in wanted:
-        if name not in by_name:
-            close = difflib.get_close_matches(name, by_name, n=1, cutoff=0)
+def _named(folder: Path, names: Sequence[str]) -> tuple[dict[str, int], dict[str, Selection]]:
+    """Number of each cluster, and the selections of the named ones."""
+    numbers, selections = {}, {}
+    for number, selection in enumerate(read_selections(folder)):
+        numbers[selection.cluster] = number
+        if selection.cluster in names:
+            selections[selection.cluster] = selection
+    for name in names:
+        if name not in selections:
+            close = difflib.get_close_matches(name, numbers, n=1, cutoff=0)
             raise InputError(f"there is no cluster {name}; did you mean {close[0]}?")
-    return [by_name[name] for name in wanted]
+    return numbers, selections
+
+
+def _draw(workspace: Workspace, found: Iterable[tuple[Cluster, Selection]]) -> str:
+    folder = workspace.root / "selection" / PICTURES_FOLDER
+    write_pictures(ProblemCutter(open_scene(workspace.scene)), found, folder, map_labels(workspace))
+    return f"pictures: {folder}"

@@ -8,11 +8,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from app.capture.inventory import Inventory
+from app.clustering.ground_plan import MapLabels
 from app.executor import available_cores, split_cores
+from app.georegister.georeference import Georeference
 from app.log import ProgressLine
 from app.run import Run
 from app.stage import digest, digest_files, finished_product, run_stage
 from app.versions import program_version
+from app.workspace import Workspace
 
 logger = logging.getLogger(__name__)
 
@@ -138,7 +141,12 @@ def cluster_stage(run: Run) -> None:
         run.workspace.root / "clusters",
         options=run.config.clustering,
         inputs={"model": model_product} | program_version("cluster"),
-        work=lambda partial: cluster(run.workspace.georegistered_model, partial, options=run.config.clustering),
+        work=lambda partial: cluster(
+            run.workspace.georegistered_model,
+            partial,
+            options=run.config.clustering,
+            labels=map_labels(run.workspace),
+        ),
         product=lambda folder: digest_files([folder / "clusters.jsonl"]),
     )
 
@@ -157,11 +165,18 @@ def select_stage(run: Run) -> None:
             run.workspace.root / "clusters",
             partial,
             options=run.config.selection,
+            labels=map_labels(run.workspace),
             num_workers=split_cores(available_cores(), run.num_jobs)[0],
             progress=ProgressLine("select"),
         ),
         product=lambda folder: digest_files([folder / "selection.jsonl"]),
     )
+
+
+def map_labels(workspace: Workspace) -> MapLabels:
+    """What lengths are measured in and where y points, by the georeference."""
+    found = Georeference.read(workspace.georeference_file)
+    return MapLabels(unit="m" if found.is_metric else "steps", up="N" if found.origin_deg_m else "y")
 
 
 def _inventory_digest(inventory: Inventory) -> str:

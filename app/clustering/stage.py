@@ -12,6 +12,7 @@ import numpy as np
 
 from app.clustering.association import Blocks
 from app.clustering.clusters import Clustering, cluster_name, find_blocks, name_clusters
+from app.clustering.ground_plan import MapLabels
 from app.clustering.map_picture import write_map
 from app.clustering.options import ClusteringOptions
 from app.errors import InputError
@@ -24,13 +25,16 @@ SCENE_FOLDER = "scene"
 """The model as arrays, beside the clusters."""
 
 
-def cluster(model_dir: Path, output_dir: Path, *, options: ClusteringOptions) -> Clustering:
+def cluster(
+    model_dir: Path, output_dir: Path, *, options: ClusteringOptions, labels: MapLabels | None = None
+) -> Clustering:
     """Cut a model into clusters of views, [O] section 3.
 
     Args:
         model_dir: COLMAP model with z up.
         output_dir: Gets ``clusters.jsonl``, ``report.json``, ``map.png``, and the model as ``scene/`` for later stages.
         options: Lengths in units of the model.
+        labels: Of the map's axes; by default metres, and y to the north.
 
     Raises:
         InputError: the model can't be read, or no block has enough keypoints and an image near by.
@@ -47,7 +51,7 @@ def cluster(model_dir: Path, output_dir: Path, *, options: ClusteringOptions) ->
     clustering = name_clusters(scene, blocks, options)
     report = _report(scene, blocks, options)
     _log(report)
-    write_map(scene, clustering, output_dir / "map.png")
+    write_map(scene, clustering, output_dir / "map.png", labels or MapLabels())
     (output_dir / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     clustering.write(output_dir)
     return clustering

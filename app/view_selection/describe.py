@@ -58,7 +58,7 @@ def tabulate_selections(selections: Iterable[Selection]) -> Iterable[str]:
         explanation = selection.explanation
         num_views = len(selection.image_names) + sum(map(len, selection.not_selected.values()))
         shares = "".join(
-            f"{_percent(coverage.before, coverage):>14}{_percent(coverage.after, coverage):>8}"
+            f"{percent(coverage.before, coverage):>14}{percent(coverage.after, coverage):>8}"
             for coverage in (explanation.keypoints, explanation.samples)
         )
         yield (
@@ -75,13 +75,13 @@ def _size(selection: Selection) -> str:
 
 def _covered(coverage: Coverage) -> str:
     return (
-        f"{_percent(coverage.before, coverage)} of {coverage.total:,} by all views,"
-        f" {_percent(coverage.after, coverage)} by the selected ones"
+        f"{percent(coverage.before, coverage)} of {coverage.total:,} by all views,"
+        f" {percent(coverage.after, coverage)} by the selected ones"
     )
 
 
-def _percent(count: int, coverage: Coverage) -> str:
-    """With a digit more than the rounding could hide: 100.0 % is all of them."""
+def percent(count: int, coverage: Coverage) -> str:
+    """Share of a cluster's points; `100.0 %` is all of them."""
     if coverage.total == 0:
         return "-"
     share = 100 * count / coverage.total

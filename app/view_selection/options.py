@@ -51,11 +51,16 @@ class SelectionOptions:
     max_solver_nodes: int = 5_000
     """Limit of each solver call, in nodes of its search: a limit of time would give other results on other machines.
     Where it is reached, the gap to the best possible is reported."""
+    max_pictures: int = 200
+    """Clusters whose picture is drawn, spread evenly over all: about 2 s of work, and as many as one may look through.
+    `cityrecon explain` draws any others."""
 
     def __post_init__(self) -> None:
         for name in ("n_vis", "n_match", "n_low", "min_shared_points", "max_solver_nodes"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if self.max_pictures < 0:
+            raise ValueError(f"max_pictures must be at least 0, not {self.max_pictures}")
         if self.n_high < self.n_low:
             raise ValueError(f"n_high must be at least n_low ({self.n_low}), not {self.n_high}")
         if not 0 <= self.min_views_fraction <= 1:

@@ -14,15 +14,19 @@ from pathlib import Path
 from typing import Any
 
 from app.clustering.clusters import Clustering
+from app.clustering.ground_plan import MapLabels
 from app.clustering.stage import SCENE_FOLDER
 from app.executor import die_with_parent
 from app.scene.read_model import open_scene
 from app.view_selection.explanation import ExplanationSums
 from app.view_selection.options import SelectionOptions
+from app.view_selection.picture import write_pictures
 from app.view_selection.problem import ProblemCutter
 from app.view_selection.selection import Selection, select_views, write_selections
 
 logger = logging.getLogger(__name__)
+
+PICTURES_FOLDER = "pictures"
 
 _BATCH = 8
 """Clusters that a worker process is given at a time."""
@@ -35,6 +39,7 @@ def select(
     output_dir: Path,
     *,
     options: SelectionOptions,
+    labels: MapLabels | None = None,
     num_workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
@@ -42,8 +47,9 @@ def select(
 
     Args:
         clusters_dir: With ``clusters.jsonl`` and the clustered model.
-        output_dir: Gets ``selection.jsonl`` and ``report.json``.
+        output_dir: Gets ``selection.jsonl``, ``report.json`` and ``pictures/CLUSTER.png``.
         options: The paper's parameters, and the method.
+        labels: Of the pictures' axes; by default metres, and y to the north.
         num_workers: Processes; the result doesn't depend on it.
         progress: Called with (clusters done, clusters in all).
 
@@ -57,6 +63,8 @@ def select(
     explained = ExplanationSums()
     gaps: dict[str, dict[str, float]] = {}
     empty: list[str] = []
+    drawn = _spread(num_clusters, options.max_pictures)
+    to_draw: list[tuple[int, Selection]] = []
 
     def counted() -> Iterator[Selection]:
         for done, selection in enumerate(_solved(reader, options, num_workers), start=1):
@@ -67,6 +75,8 @@ def select(
                 gaps[selection.cluster] = {"size": selection.size_gap, "quality": selection.quality_gap}
             if not selection.image_names:
                 empty.append(selection.cluster)
+            if done - 1 in drawn:
+                to_draw.append((done - 1, selection))
             if progress is not None:
                 progress(done, num_clusters)
             yield selection
@@ -86,6 +96,8 @@ def select(
         "clusters_without_stereo_pair": empty,
     }
     (output_dir / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    found = ((reader.clusters[number], selection) for number, selection in to_draw)
+    write_pictures(reader.cutter, found, output_dir / PICTURES_FOLDER, labels or MapLabels())
     logger.info(
         "%d images selected for %d clusters: %.1f images per cluster, %.2f clusters per image",
         totals["selected"],
@@ -99,6 +111,12 @@ def select(
         logger.warning("cluster %s has no two views that match: it stays empty", name)
 
 
+def _spread(num_clusters: int, max_chosen: int) -> set[int]:
+    """At most so many of the clusters' numbers, evenly spread."""
+    count = min(max_chosen, num_clusters)
+    return {number * num_clusters // count for number in range(count)}
+
+
 class _ClusterReader:
     """The clusters of a folder and their problems; each process has one of its own."""
 
@@ -106,11 +124,11 @@ class _ClusterReader:
         self.folder = clusters_dir
         self.clusters = Clustering.read(clusters_dir).clusters
         self.scene = open_scene(clusters_dir / SCENE_FOLDER)
-        self._cutter = ProblemCutter(self.scene)
+        self.cutter = ProblemCutter(self.scene)
 
     def select(self, batch: range, options: SelectionOptions) -> list[Selection]:
         return [
-            select_views(self._cutter.problem(self.clusters[number], options.visibility), options) for number in batch
+            select_views(self.cutter.problem(self.clusters[number], options.visibility), options) for number in batch
         ]
 
 

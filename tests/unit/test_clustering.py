@@ -6,11 +6,14 @@ import json
 import logging
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from app.clustering.association import Block, DropReason
 from app.clustering.clusters import Clustering, cluster_views
+from app.clustering.ground_plan import RED, MapLabels
+from app.clustering.map_picture import color_numbers, write_map
 from app.clustering.merging import merge_small_blocks
 from app.clustering.options import ClusteringOptions
 from app.clustering.samples import grid_points, height_range, sample_axes
@@ -19,7 +22,7 @@ from app.errors import InputError
 from app.scene.point_index import PointIndex, tile_keys
 from app.scene.posed_scene import PosedScene
 from app.scene.submodel import write_submodel
-from tests.reference.posed_scenes import level_camera, make_scene
+from tests.reference.posed_scenes import level_camera, make_scene, random_scene, shuffled
 
 
 def _patch(x: float, y: float, count: int = 6) -> list[list[float]]:
@@ -233,3 +236,24 @@ def test_damaged_clusters_file(tmp_path: Path) -> None:
 def test_options_are_checked(name: str, value: object) -> None:
     with pytest.raises(ValueError, match=f"{name} must"):
         ClusteringOptions(**{name: value})  # type: ignore[arg-type]
+
+
+def test_neighbours_on_the_map_have_different_colours() -> None:
+    cells = [((i, j),) for i in range(9) for j in range(9)]
+    numbers = dict(zip((one for (one,) in cells), color_numbers(cells), strict=True))
+    for (i, j), number in numbers.items():
+        around = [(i + di, j + dj) for di in (-1, 0, 1) for dj in (-1, 0, 1) if (di, dj) != (0, 0)]
+        assert number not in [numbers[cell] for cell in around if cell in numbers]
+    assert len(set(numbers.values())) > 4
+    merged = [((0, 0), (1, 0)), ((2, 0),), ((3, 0), (3, 1))]
+    assert len(set(color_numbers(merged)[:2])) == 2
+
+
+def test_the_map_is_the_same_whatever_the_order_of_points(tmp_path: Path) -> None:
+    scene = random_scene(4)
+    other, _ = shuffled(scene, 1)
+    for name, one in (("a.png", scene), ("b.png", other)):
+        write_map(one, cluster_views(one, ClusteringOptions()), tmp_path / name, MapLabels())
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    image = cv2.imread(str(tmp_path / "a.png"))
+    assert image is not None and (image == RED).all(axis=-1).sum() > 100

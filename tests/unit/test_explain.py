@@ -9,11 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.clustering.clusters import cluster_views
+from app.clustering.clusters import Cluster, cluster_views
+from app.clustering.grid import GroundGrid
+from app.clustering.ground_plan import RED, MapLabels
 from app.clustering.options import ClusteringOptions
 from app.config import RunConfig, update_config
 from app.errors import InputError
 from app.explain import explain
+from app.georegister.georeference import Georeference, GravitySource, ScaleSource
 from app.run import Run
 from app.scene.posed_scene import PosedScene
 from app.scene.submodel import write_submodel
@@ -22,6 +25,7 @@ from app.stages import cluster_stage, select_stage
 from app.view_selection.describe import describe_selection, describe_view
 from app.view_selection.explanation import Coverage, Explanation
 from app.view_selection.options import SelectionOptions, Visibility
+from app.view_selection.picture import NOT_NEEDED, draw_panels, draw_selection
 from app.view_selection.problem import ProblemCutter
 from app.view_selection.selection import Selection, read_selections, select_views
 from app.workspace import Workspace
@@ -33,13 +37,19 @@ def _selected(scene: PosedScene, root: Path, **settings: dict[str, object]) -> W
     root.mkdir()
     run = Run(workspace=Workspace(root), config=update_config(RunConfig(), settings, where="test"))
     images, points = np.arange(len(scene.image_names)), np.arange(len(scene.point_ids))
-    run_stage(
-        root / "georegister",
-        options={},
-        inputs={},
-        work=lambda partial: write_submodel(scene, images, points, partial / "model"),
-        product=lambda _: "",
-    )
+
+    def georegister(partial: Path) -> None:
+        write_submodel(scene, images, points, partial / "model")
+        Georeference(
+            crs="local",
+            origin_deg_m=None,
+            is_metric=False,
+            scale_source=ScaleSource.NONE,
+            gravity_source=GravitySource.CAMERAS,
+            gravity_sigma_deg=1.0,
+        ).write(partial / "georeference.json")
+
+    run_stage(root / "georegister", options={}, inputs={}, work=georegister, product=lambda _: "")
     cluster_stage(run)
     select_stage(run)
     return run.workspace
@@ -117,10 +127,29 @@ def test_the_command_explains_named_clusters_or_tabulates_all(tmp_path: Path) ->
     assert len(selections) > 2
     table = list(explain(workspace, []))
     assert [line.split()[0] for line in table[2:]] == [selection.cluster for selection in selections]
-    chosen = selections[2], selections[0]
-    assert list(explain(workspace, [s.cluster for s in chosen])) == [describe_selection(s) for s in chosen]
+    chosen, pictures = (selections[2], selections[0]), workspace.root / "selection" / "pictures"
+    expected = [*map(describe_selection, chosen), f"pictures: {pictures}"]
+    assert list(explain(workspace, [s.cluster for s in chosen])) == expected
     with pytest.raises(InputError, match=f"no cluster {chosen[0].cluster}0; did you mean {chosen[0].cluster}"):
-        explain(workspace, [f"{chosen[0].cluster}0"])
+        list(explain(workspace, [f"{chosen[0].cluster}0"]))
+
+
+def test_the_stage_draws_some_clusters_and_the_command_any(tmp_path: Path) -> None:
+    settings = {"clustering": {"sample_spacing_m": 4.0}, "selection": {"max_pictures": 2}}
+    workspace = _selected(random_scene(5), tmp_path / "ws", **settings)
+    names = [selection.cluster for selection in read_selections(workspace.root / "selection")]
+    pictures = workspace.root / "selection" / "pictures"
+
+    def drawn() -> dict[str, bytes]:
+        return {path.name: path.read_bytes() for path in sorted(pictures.iterdir())}
+
+    first = drawn()
+    assert sorted(first) == [f"{names[0]}.png", f"{names[len(names) // 2]}.png"]
+    list(explain(workspace, [names[1]]))
+    assert sorted(drawn()) == sorted([*first, f"{names[1]}.png"])
+    list(explain(workspace, [], draw_all=True))
+    assert sorted(drawn()) == [f"{name}.png" for name in names]
+    assert {name: drawn()[name] for name in first} == first
 
 
 def test_the_report_sums_the_explanations(tmp_path: Path) -> None:
@@ -131,3 +160,40 @@ def test_the_report_sums_the_explanations(tmp_path: Path) -> None:
         sums = [getattr(selection.explanation, name) for selection in selections]
         assert report[key] == {field: sum(getattr(c, field) for c in sums) for field in ("total", "before", "after")}
     assert sum(report["selected_images_by_reason"].values()) == report["num_images_after_selection"]
+
+
+def _count(image: np.ndarray, color: tuple[int, int, int]) -> int:
+    return int(np.all(image == color, axis=-1).sum())
+
+
+def test_a_picture_shows_all_views_before_and_the_selected_ones_after() -> None:
+    """Twelve views in a row see a wall; only two that look the other way see the points x, so both are needed.
+
+    x      > > > >   < <   wall
+    """
+    wall = [[10.0 + 0.01 * k, y, z] for k, y in enumerate(np.linspace(-8, 8, 9)) for z in (1.0, 2.0)]
+    cameras = {f"{k:02d}.jpg": level_camera([0, k - 6, 1.5], 0) for k in range(12)}
+    cameras |= {f"back{k}.jpg": level_camera([5, 2 * k, 1.5], 180) for k in range(2)}
+    scene = make_scene(cameras, wall + [[-8.0, 1.0, 1.0 + 0.1 * k] for k in range(6)])
+    grid = GroundGrid(origin_m=(-20.0, -20.0), block_size_m=(40.0, 40.0), overlap_m=0.0, sample_spacing_m=40.0)
+    cluster = Cluster(
+        name="x0000_y0000",
+        grid=grid,
+        cells=((0, 0),),
+        z_range_m=(0.0, 3.0),
+        num_keypoints=len(scene.point_ids),
+        is_small=False,
+        image_names=scene.image_names,
+    )
+    problem = ProblemCutter(scene).problem(cluster, Visibility.FRUSTUM)
+    selection = select_views(problem, SelectionOptions(n_match=1, n_low=5, n_high=5, min_shared_points=1))
+    assert set(selection.image_names) > {"back0.jpg", "back1.jpg"}
+    assert len(selection.image_names) == 5
+    before, after = draw_panels(problem, cluster, selection, MapLabels())
+    dot = _count(before, RED) / 14
+    assert dot > 10
+    assert _count(after, RED) == pytest.approx(2 * dot, rel=0.2)
+    assert _count(after, NOT_NEEDED) == pytest.approx(3 * dot, rel=0.2)
+    assert _count(before, NOT_NEEDED) == 0
+    whole = draw_selection(problem, cluster, selection, MapLabels())
+    assert _count(whole, NOT_NEEDED) > _count(after, NOT_NEEDED)

@@ -216,7 +216,7 @@ def test_damaged_selection_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "value"),
     [("n_vis", 0), ("n_match", 0), ("n_low", 0), ("n_high", 9), ("min_views_fraction", 1.5), ("min_shared_points", 0),
-     ("max_solver_nodes", 0)],
+     ("max_solver_nodes", 0), ("max_pictures", -1)],
 )  # fmt: skip
 def test_options_are_checked(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"{name} must"):

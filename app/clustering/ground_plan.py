@@ -1,0 +1,287 @@
+"""Pictures of the ground from above: dots, rays, cells, a scale bar and a north arrow, drawn with OpenCV."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from app.errors import CityReconError
+
+Image = NDArray[np.uint8]
+Color = tuple[int, int, int]
+"""Blue, green, red."""
+
+WHITE: Color = (255, 255, 255)
+INK: Color = (50, 46, 44)
+GREY: Color = (125, 120, 116)
+LIGHT_GREY: Color = (205, 200, 196)
+BLUE: Color = (196, 112, 40)
+RED: Color = (44, 38, 200)
+
+_SHIFT = 4
+_SUBPIXELS = 1 << _SHIFT
+"""OpenCV draws at this fraction of a pixel."""
+_DASH_PX, _GAP_PX = 9.0, 6.0
+_CHUNK_DOTS, _CHUNK_POSITIONS = 20_000, 1 << 20
+
+
+@dataclass(frozen=True)
+class MapLabels:
+    """What the axes of the world are called."""
+
+    unit: str = "m"
+    """Of lengths."""
+    up: str = "N"
+    """Where y points."""
+
+
+class GroundPlan:
+    """An image of a rectangle of the ground; x is to the right, y is up, and both have one scale."""
+
+    def __init__(self, low: NDArray[np.float64], high: NDArray[np.float64], size_px: tuple[int, int]) -> None:
+        """A white image, with a rectangle in its middle as large as fits.
+
+        Args:
+            low: (2,) corner of the rectangle.
+            high: (2,) opposite corner; greater.
+            size_px: Width and height.
+        """
+        self.image = blank(*size_px)
+        self.px_per_unit = float((np.array(size_px) / (high - low)).min())
+        self._middle = (low + high) / 2
+
+    def copy(self) -> GroundPlan:
+        """Another image of the same ground, so far the same."""
+        other = copy.copy(self)
+        other.image = self.image.copy()
+        return other
+
+    def to_pixels(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pixel coordinates (..., 2) of positions (..., 2 or more); centres of pixels are whole numbers."""
+        offsets = (positions[..., :2] - self._middle) * (self.px_per_unit, -self.px_per_unit)
+        pixels: NDArray[np.float64] = offsets + (np.array(self.image.shape[1::-1]) - 1) / 2
+        return pixels
+
+    def shows(self, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """(n,) whether any of the image is in each rectangle, (n, 2, 2) lower and upper corner."""
+        (left, bottom), (right, top) = self.to_pixels(corners).transpose(1, 2, 0)
+        height, width = self.image.shape[:2]
+        shown: NDArray[np.bool_] = (right > 0) & (left < width) & (bottom > 0) & (top < height)
+        return shown
+
+    def dots(self, positions: NDArray[np.float64], radius_px: float, color: Color, opacity: float = 1.0) -> None:
+        """Smooth round dots, to a quarter of a pixel; where several lie on each other, there is one."""
+        height, width = self.image.shape[:2]
+        side = math.floor(2 * radius_px + 1) + 1
+        phases = np.arange(4) / 4
+        starts = np.ceil(phases - radius_px - 0.5).astype(np.int64)
+        along = starts[:, None] + np.arange(side) - phases[:, None]
+        distance = np.hypot(along[:, None, :, None], along[None, :, None, :])
+        stamps = np.clip(radius_px + 0.5 - distance, 0, 1).astype(np.float32).reshape(4, 4, -1)
+        margin = 2 * side
+        stride = width + 2 * margin
+        steps = (np.arange(side)[:, None] * stride + np.arange(side)).reshape(-1)
+        cover = np.zeros((height + 2 * margin) * stride, dtype=np.float32)
+        quarters = self._distinct_quarters(positions, side) + 4 * margin
+        for start in range(0, len(quarters), _CHUNK_DOTS):
+            (x, y), (phase_x, phase_y) = np.divmod(quarters[start : start + _CHUNK_DOTS].T, 4)
+            first = (y + starts[phase_y]) * stride + x + starts[phase_x]
+            np.maximum.at(cover, first[:, None] + steps, stamps[phase_y, phase_x])
+        inner = cover.reshape(-1, stride)[margin:-margin, margin:-margin]
+        self.mix(inner * np.float32(opacity), color)
+
+    def _distinct_quarters(self, positions: NDArray[np.float64], margin: int) -> NDArray[np.int64]:
+        """Pixel coordinates of positions in or near the image, in quarters of a pixel, each once."""
+        height, width = self.image.shape[:2]
+        stride = 4 * (width + 2 * margin) + 1
+        keys = [np.empty(0, dtype=np.int64)]
+        for start in range(0, len(positions), _CHUNK_POSITIONS):
+            x, y = self.to_pixels(positions[start : start + _CHUNK_POSITIONS]).T
+            near = (x > -margin) & (x < width + margin) & (y > -margin) & (y < height + margin)
+            x, y = np.round(4 * (x[near] + margin)), np.round(4 * (y[near] + margin))
+            keys.append(np.unique((y * stride + x).astype(np.int64)))
+        rows, columns = np.divmod(np.unique(np.concatenate(keys)), stride)
+        return np.stack([columns, rows], axis=1) - 4 * margin
+
+    def haze(self, positions: NDArray[np.float64], color: Color, opacity: float) -> None:
+        """Colour pixels by how many positions are in them; time and memory are small also for millions."""
+        height, width = self.image.shape[:2]
+        counts = np.zeros(height * width, dtype=np.int64)
+        for start in range(0, len(positions), _CHUNK_POSITIONS):
+            x, y = np.round(self.to_pixels(positions[start : start + _CHUNK_POSITIONS])).T
+            inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+            x, y = x[inside].astype(np.int64), y[inside].astype(np.int64)
+            counts += np.bincount(y * width + x, minlength=len(counts))
+        self.mix(1 - (1 - opacity) ** counts.reshape(height, width), color)
+
+    def mix(self, share: NDArray[np.floating], color: Color) -> None:
+        """Mix shares (H, W) of a colour into the image."""
+        painted = np.flatnonzero(share > 0)
+        alpha = share.reshape(-1)[painted, None]
+        flat = self.image.reshape(-1, 3)
+        flat[painted] = np.round(flat[painted] * (1 - alpha) + np.array(color) * alpha).astype(np.uint8)
+
+    def lines(self, ends: NDArray[np.float64], color: Color, thickness_px: int = 1) -> None:
+        """Smooth lines between positions (n, 2 or more, 2)."""
+        self._lines_px(self.to_pixels(ends), color, thickness_px)
+
+    def dashed_lines(self, ends: NDArray[np.float64], color: Color, thickness_px: int = 1) -> None:
+        """Dashed lines between positions (n, 2, 2); a dash begins and a dash ends each."""
+        dashes = []
+        for start, end in self.to_pixels(ends):
+            length = float(np.hypot(*(end - start)))
+            count = max(1, round((length + _GAP_PX) / (_DASH_PX + _GAP_PX)))
+            period = (length + _GAP_PX) / count
+            along = np.stack([np.arange(count) * period, np.arange(count) * period + period - _GAP_PX], axis=1)
+            dashes.append(start + along[..., None] / max(length, 1e-9) * (end - start))
+        if dashes:
+            self._lines_px(np.concatenate(dashes), color, thickness_px)
+
+    def rays(
+        self, starts: NDArray[np.float64], directions: NDArray[np.float64], length_px: float, color: Color
+    ) -> None:
+        """A line from each position (n, 3) along its direction (n, 3) as it looks from above."""
+        pixels = self.to_pixels(starts)
+        self._lines_px(np.stack([pixels, pixels + length_px * directions[:, :2] * (1, -1)], axis=1), color, 1)
+
+    def _lines_px(self, ends: NDArray[np.float64], color: Color, thickness_px: int) -> None:
+        fixed = np.round(np.clip(ends, -1e6, 1e6) * _SUBPIXELS).astype(np.int32)
+        cv2.polylines(self.image, list(fixed), False, color, thickness_px, cv2.LINE_AA, _SHIFT)
+
+    def boxes(self, corners: NDArray[np.float64], color: Color) -> None:
+        """Filled rectangles, (n, 2, 2) lower and upper corner of each; they end on whole pixels."""
+        width, height = self.image.shape[1::-1]
+        ends = np.round(self.to_pixels(corners) + 0.5).clip(0, (width, height)).astype(np.int64)
+        for (left, bottom), (right, top) in ends.tolist():
+            self.image[top:bottom, left:right] = color
+
+    def scale_bar(self, labels: MapLabels, text_scale: float = 0.5) -> None:
+        """A bar of a round length in the lower left corner, and an arrow to the north in the upper right one."""
+        height, width = self.image.shape[:2]
+        length = round_length(0.22 * width / self.px_per_unit)
+        left, bottom, bar_px = 18, height - 18, length * self.px_per_unit
+        text = f"{length:g} {labels.unit}"
+        backing(
+            self.image,
+            (left - 8, bottom - 32),
+            (left + max(round(bar_px), text_width(text, text_scale)) + 8, bottom + 8),
+        )
+        bar = np.array([[left, bottom - 5], [left, bottom], [left + bar_px, bottom], [left + bar_px, bottom - 5]])
+        self._lines_px(bar[None], INK, 2)
+        write(self.image, text, (left, bottom - 10), text_scale)
+        x, y = width - 28, 22
+        backing(self.image, (x - 16, y - 16), (x + 16, y + 42))
+        arrow = np.array([[x, y - 9], [x + 7, y + 13], [x, y + 8], [x - 7, y + 13]])
+        cv2.fillPoly(self.image, [arrow * _SUBPIXELS], INK, cv2.LINE_AA, _SHIFT)
+        write(self.image, labels.up, (x - text_width(labels.up, text_scale) // 2, y + 34), text_scale)
+
+    def label(self, text: str, at_px: tuple[int, int], scale: float) -> None:
+        """A text on a light ground, from its lower left corner."""
+        x, y = at_px
+        backing(self.image, (x - 3, y - round(30 * scale)), (x + text_width(text, scale) + 3, y + round(10 * scale)))
+        write(self.image, text, at_px, scale)
+
+    def frame(self) -> None:
+        """A thin line around the image."""
+        height, width = self.image.shape[:2]
+        cv2.rectangle(self.image, (0, 0), (width - 1, height - 1), LIGHT_GREY, 1)
+
+
+def outline(cells: Sequence[tuple[int, int]]) -> NDArray[np.int64]:
+    """(n, 2, 2) ends of the sides of the union of cells, in cells: a side between two of them isn't one."""
+    inside = set(cells)
+    sides = []
+    for i, j in cells:
+        for neighbour, ends in (
+            ((i - 1, j), ((i, j), (i, j + 1))),
+            ((i + 1, j), ((i + 1, j), (i + 1, j + 1))),
+            ((i, j - 1), ((i, j), (i + 1, j))),
+            ((i, j + 1), ((i, j + 1), (i + 1, j + 1))),
+        ):
+            if neighbour not in inside:
+                sides.append(ends)
+    return np.array(sides, dtype=np.int64).reshape(-1, 2, 2)
+
+
+def round_length(length: float) -> float:
+    """The greatest of 1, 2 and 5 times a power of ten that isn't longer."""
+    power = 10.0 ** math.floor(math.log10(length))
+    return power * max(factor for factor in (1, 2, 5) if factor * power <= length * (1 + 1e-9))
+
+
+def blank(width_px: int, height_px: int) -> Image:
+    """A white image."""
+    return np.full((height_px, width_px, 3), 255, dtype=np.uint8)
+
+
+def legend(
+    image: Image, at_px: tuple[int, int], entries: Sequence[tuple[str, Color, str]], text_scale: float = 0.42
+) -> None:
+    """A line that explains symbols, from its lower left corner.
+
+    Args:
+        image: To draw on.
+        at_px: Lower left corner.
+        entries: ``dot``, ``ray``, ``box``, ``line``, ``dash`` or ``cross``; its colour; what it means.
+        text_scale: Of the texts; 1 makes letters about 20 pixels high.
+    """
+    x, y = at_px
+    for symbol, color, text in entries:
+        part = GroundPlan(np.zeros(2), np.array([22.0, 14.0]), (22, 14))
+        left, right = np.array([[3.0, 7.0]]), np.array([[19.0, 7.0]])
+        across = np.stack([left, right], axis=1)
+        if symbol == "box":
+            part.boxes(np.array([[[1.0, 1.0], [21.0, 13.0]]]), color)
+        elif symbol == "dash":
+            part.dashed_lines(across, color, 2)
+        elif symbol == "cross":
+            part.lines(np.array([[[6.0, 2.0], [16.0, 12.0]], [[6.0, 12.0], [16.0, 2.0]]]), color, 2)
+        elif symbol == "line":
+            part.lines(across, color, 2)
+        elif symbol == "ray":
+            part.lines(across, color)
+            part.dots(left, 2.6, color)
+        else:
+            part.dots((left + right) / 2, 2.6, color)
+        middle = y - round(9 * text_scale)
+        image[middle - 7 : middle + 7, x : x + 22] = part.image
+        write(image, text, (x + 28, y), text_scale)
+        x += 50 + text_width(text, text_scale)
+
+
+def write(image: Image, text: str, at_px: tuple[int, int], scale: float, color: Color = INK) -> None:
+    """Write a line of text from its lower left corner; other letters than ASCII's become question marks."""
+    plain = text.encode("ascii", errors="replace").decode("ascii")
+    cv2.putText(image, plain, at_px, cv2.FONT_HERSHEY_SIMPLEX, scale, color, 1, cv2.LINE_AA)
+
+
+def text_width(text: str, scale: float) -> int:
+    """How many pixels a text is wide."""
+    return int(cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0])
+
+
+def backing(image: Image, low_px: tuple[int, int], high_px: tuple[int, int]) -> None:
+    """Fade what lies under a label."""
+    (left, top), (right, bottom) = np.maximum([low_px, high_px], 0).tolist()
+    part = image[top:bottom, left:right]
+    part[:] = np.round(part * 0.15 + 0.85 * 255).astype(np.uint8)
+
+
+def encode_png(image: Image, compression: int = 3) -> bytes:
+    """The image as PNG, compressed little and fast by default; 9 is most and slow.
+
+    Raises:
+        CityReconError: it can't be encoded.
+    """
+    ok, encoded = cv2.imencode(
+        ".png", image, [cv2.IMWRITE_PNG_COMPRESSION, compression, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE]
+    )
+    if not ok:
+        raise CityReconError(f"cannot encode an image of {image.shape[1]} x {image.shape[0]} pixels")
+    return encoded.tobytes()
