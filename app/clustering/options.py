@@ -25,11 +25,11 @@ class ClusteringOptions:
     max_camera_distance_m: float = 38.0
     """Images taken farther than this from a block's centre, on the ground, don't join it.
 
-    [O] gives no number. At 38 m five simulated drives with the numbers of images, keypoints and clusters of [O]'s table
-    1 come to its images per cluster (174 to 195) and clusters per image (4.6 to 5.3); 36 and 40 m give about 7 % fewer and
-    more. The depth error grows with the distance squared: at 38 m, with a focal length of 1,500 px, a baseline of 2 m
-    and matches good to half a pixel, it is 0.24 m. Also, what is farther away in a street is mostly hidden behind
-    houses.
+    [O] gives no number. At 38 m five simulated drives with the numbers of images, keypoints and clusters of [O]'s
+    table 1 come to its images per cluster (174 to 195) and clusters per image (4.6 to 5.3); 36 and 40 m give about 7 %
+    fewer and more. The depth error grows with the distance squared: at 38 m, with a focal length of 1,500 px, a
+    baseline of 2 m and matches good to half a pixel, it is 0.24 m. Also, what is farther away in a street is mostly
+    hidden behind houses.
     """
     min_cameras_per_cluster: int = 10
     """Clusters with fewer images are merged into a neighbour; [O] section 3."""
