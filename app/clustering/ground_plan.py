@@ -24,10 +24,12 @@ LIGHT_GREY: Color = (205, 200, 196)
 BLUE: Color = (196, 112, 40)
 RED: Color = (44, 38, 200)
 
+SCALE_BAR_PX = 46
 _SHIFT = 4
 _SUBPIXELS = 1 << _SHIFT
 """OpenCV draws at this fraction of a pixel."""
 _DASH_PX, _GAP_PX = 9.0, 6.0
+_SWATCH_PX = (28, 14)
 _CHUNK_DOTS, _CHUNK_POSITIONS = 20_000, 1 << 20
 
 
@@ -44,17 +46,21 @@ class MapLabels:
 class GroundPlan:
     """An image of a rectangle of the ground; x is to the right, y is up, and both have one scale."""
 
-    def __init__(self, low: NDArray[np.float64], high: NDArray[np.float64], size_px: tuple[int, int]) -> None:
+    def __init__(
+        self, low: NDArray[np.float64], high: NDArray[np.float64], size_px: tuple[int, int], foot_px: int = 0
+    ) -> None:
         """A white image, with a rectangle in its middle as large as fits.
 
         Args:
             low: (2,) corner of the rectangle.
             high: (2,) opposite corner; greater.
             size_px: Width and height.
+            foot_px: Height at the bottom that the rectangle leaves free.
         """
         self.image = blank(*size_px)
-        self.px_per_unit = float((np.array(size_px) / (high - low)).min())
-        self._middle = (low + high) / 2
+        room = np.array([size_px[0], size_px[1] - foot_px])
+        self.px_per_unit = float((room / (high - low)).min())
+        self._middle, self._middle_px = (low + high) / 2, (room - 1) / 2
 
     def copy(self) -> GroundPlan:
         """Another image of the same ground, so far the same."""
@@ -65,7 +71,7 @@ class GroundPlan:
     def to_pixels(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Pixel coordinates (..., 2) of positions (..., 2 or more); centres of pixels are whole numbers."""
         offsets = (positions[..., :2] - self._middle) * (self.px_per_unit, -self.px_per_unit)
-        pixels: NDArray[np.float64] = offsets + (np.array(self.image.shape[1::-1]) - 1) / 2
+        pixels: NDArray[np.float64] = offsets + self._middle_px
         return pixels
 
     def shows(self, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -162,24 +168,22 @@ class GroundPlan:
             self.image[top:bottom, left:right] = color
 
     def scale_bar(self, labels: MapLabels, text_scale: float = 0.5) -> None:
-        """A bar of a round length in the lower left corner, and an arrow to the north in the upper right one."""
+        """A bar of a round length and an arrow to the north, in the lower `SCALE_BAR_PX` rows."""
         height, width = self.image.shape[:2]
         length = round_length(0.22 * width / self.px_per_unit)
-        left, bottom, bar_px = 18, height - 18, length * self.px_per_unit
+        left, bottom, bar_px = 18, height - 14, length * self.px_per_unit
         text = f"{length:g} {labels.unit}"
-        backing(
-            self.image,
-            (left - 8, bottom - 32),
-            (left + max(round(bar_px), text_width(text, text_scale)) + 8, bottom + 8),
-        )
+        right = left + max(round(bar_px), text_width(text, text_scale))
+        backing(self.image, (left - 8, height - SCALE_BAR_PX), (right + 8, height))
         bar = np.array([[left, bottom - 5], [left, bottom], [left + bar_px, bottom], [left + bar_px, bottom - 5]])
         self._lines_px(bar[None], INK, 2)
-        write(self.image, text, (left, bottom - 10), text_scale)
-        x, y = width - 28, 22
-        backing(self.image, (x - 16, y - 16), (x + 16, y + 42))
-        arrow = np.array([[x, y - 9], [x + 7, y + 13], [x, y + 8], [x - 7, y + 13]])
+        write(self.image, text, (left, bottom - 9), text_scale)
+        x, y = width - 24, height - 22
+        left = x - 14 - text_width(labels.up, text_scale)
+        backing(self.image, (left - 6, height - SCALE_BAR_PX), (width, height))
+        arrow = np.array([[x, y - 13], [x + 8, y + 11], [x, y + 5], [x - 8, y + 11]])
         cv2.fillPoly(self.image, [arrow * _SUBPIXELS], INK, cv2.LINE_AA, _SHIFT)
-        write(self.image, labels.up, (x - text_width(labels.up, text_scale) // 2, y + 34), text_scale)
+        write(self.image, labels.up, (left, y + 7), text_scale)
 
     def label(self, text: str, at_px: tuple[int, int], scale: float) -> None:
         """A text on a light ground, from its lower left corner."""
@@ -232,27 +236,27 @@ def legend(
         text_scale: Of the texts; 1 makes letters about 20 pixels high.
     """
     x, y = at_px
+    width, height = _SWATCH_PX
+    left, right = np.array([[4.0, height / 2]]), np.array([[width - 4.0, height / 2]])
     for symbol, color, text in entries:
-        part = GroundPlan(np.zeros(2), np.array([22.0, 14.0]), (22, 14))
-        left, right = np.array([[3.0, 7.0]]), np.array([[19.0, 7.0]])
-        across = np.stack([left, right], axis=1)
+        swatch = GroundPlan(np.zeros(2), np.array([width, height]), _SWATCH_PX)
         if symbol == "box":
-            part.boxes(np.array([[[1.0, 1.0], [21.0, 13.0]]]), color)
+            swatch.boxes(np.array([[[2, 0], [width - 2, height]]]), color)
         elif symbol == "dash":
-            part.dashed_lines(across, color, 2)
+            swatch.dashed_lines(np.array([[[1, height / 2], [width - 1, height / 2]]]), color, 2)
         elif symbol == "cross":
-            part.lines(np.array([[[6.0, 2.0], [16.0, 12.0]], [[6.0, 12.0], [16.0, 2.0]]]), color, 2)
+            swatch.lines(np.array([[[8, 1], [20, 13]], [[8, 13], [20, 1]]]), color, 2)
         elif symbol == "line":
-            part.lines(across, color, 2)
+            swatch.lines(np.stack([left, right], axis=1), color, 2)
         elif symbol == "ray":
-            part.lines(across, color)
-            part.dots(left, 2.6, color)
+            swatch.lines(np.stack([left, right], axis=1), color)
+            swatch.dots(left, 2.6, color)
         else:
-            part.dots((left + right) / 2, 2.6, color)
-        middle = y - round(9 * text_scale)
-        image[middle - 7 : middle + 7, x : x + 22] = part.image
-        write(image, text, (x + 28, y), text_scale)
-        x += 50 + text_width(text, text_scale)
+            swatch.dots((left + right) / 2, 2.6, color)
+        top = y - round(9 * text_scale) - height // 2
+        image[top : top + height, x : x + width] = swatch.image
+        write(image, text, (x + width + 6, y), text_scale)
+        x += width + 28 + text_width(text, text_scale)
 
 
 def write(image: Image, text: str, at_px: tuple[int, int], scale: float, color: Color = INK) -> None:

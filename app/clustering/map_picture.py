@@ -17,6 +17,7 @@ from app.clustering.ground_plan import (
     INK,
     LIGHT_GREY,
     RED,
+    SCALE_BAR_PX,
     WHITE,
     Color,
     GroundPlan,
@@ -81,7 +82,8 @@ def write_map(scene: PosedScene, clustering: Clustering, path: Path, labels: Map
     low, high = cells.min(axis=0), cells.max(axis=0) + 1
     margin = _MARGIN * (high - low) * size
     height = int(np.clip(_PANEL_PX * np.divide(*((high - low) * size)[::-1]), _MIN_HEIGHT_PX, _PANEL_PX))
-    raw = GroundPlan(low * size + grid.origin_m - margin, high * size + grid.origin_m + margin, (_PANEL_PX, height))
+    corners = low * size + grid.origin_m - margin, high * size + grid.origin_m + margin
+    raw = GroundPlan(*corners, (_PANEL_PX, height), SCALE_BAR_PX)
     whole = raw.copy()
     dropped = np.array([block.cell for block in clustering.dropped], dtype=np.int64).reshape(-1, 2)
     raw.boxes(_corners(dropped, grid), _DROPPED)

@@ -16,6 +16,7 @@ from app.clustering.ground_plan import (
     INK,
     LIGHT_GREY,
     RED,
+    SCALE_BAR_PX,
     Color,
     GroundPlan,
     Image,
@@ -34,7 +35,7 @@ from app.view_selection.selection import Selection
 from app.workspace import atomic_file
 
 _PANEL_PX, _GAP_PX, _HEAD_PX, _LINE_PX = 560, 12, 92, 22
-_MARGIN = 0.06
+_MARGIN = 0.04
 _MIN_SPAN = 1e-3
 _RAY_PX = 17.0
 _PADDED: Color = (250, 246, 240)
@@ -102,7 +103,7 @@ def _ground(problem: ViewProblem, cluster: Cluster) -> GroundPlan:
     shown = np.concatenate([boxes.reshape(-1, 2), problem.centers_in_world[:, :2]])
     low, high = shown.min(axis=0), shown.max(axis=0)
     half = max(float((high - low).max()) / 2, _MIN_SPAN) * (1 + 2 * _MARGIN)
-    plan = GroundPlan((low + high) / 2 - half, (low + high) / 2 + half, (_PANEL_PX, _PANEL_PX))
+    plan = GroundPlan((low + high) / 2 - half, (low + high) / 2 + half, (_PANEL_PX, _PANEL_PX), SCALE_BAR_PX)
     plan.boxes(boxes, _PADDED)
     plan.dots(problem.keypoints_in_world, 1.1, BLUE, 0.8)
     sides = outline(cluster.cells) * np.array(cluster.grid.block_size_m) + cluster.grid.origin_m
@@ -140,14 +141,15 @@ def _head(selection: Selection, width: int) -> Image:
 
 def _foot(selection: Selection, width: int) -> Image:
     if not selection.relaxed:
-        return _legend(width)
+        return legend_of_panels(width)
     bar = blank(width, _LINE_PX)
     write(bar, f"Relaxed: {'; '.join(selection.relaxed)}", (_GAP_PX, 14), 0.42, GREY)
-    return np.concatenate([_legend(width), bar])
+    return np.concatenate([legend_of_panels(width), bar])
 
 
 @cache
-def _legend(width: int) -> Image:
+def legend_of_panels(width: int, text_scale: float = 0.42) -> Image:
+    """What the symbols mean."""
     bar = blank(width, 3 * _LINE_PX // 2)
     entries = (
         ("dash", INK, "cells"),
@@ -157,5 +159,5 @@ def _legend(width: int) -> Image:
         ("ray", NOT_NEEDED, "other selected view"),
         ("dot", LIGHT_GREY, "view that is not selected"),
     )
-    legend(bar, (_GAP_PX, _LINE_PX), entries)
+    legend(bar, (_GAP_PX, _LINE_PX), entries, text_scale)
     return bar

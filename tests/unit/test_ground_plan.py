@@ -28,6 +28,9 @@ def test_x_is_to_the_right_y_is_up_and_the_middle_stays_in_the_middle() -> None:
     assert wide.px_per_unit == 1
     np.testing.assert_allclose(wide.to_pixels(np.array([[120.0, 60.0]])), [[39.5, 9.5]])
 
+    above = GroundPlan(np.array([100.0, 50.0]), np.array([140.0, 70.0]), (40, 50), 30)
+    np.testing.assert_allclose(above.to_pixels(np.array([[100.5, 50.5]])), [[0, 19]])
+
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (0.25, 0.5), (-0.5, 0.25)])
 def test_a_dot_has_its_place_and_area_to_a_fraction_of_a_pixel(offset: tuple[float, float]) -> None:
@@ -105,12 +108,12 @@ def test_scale_bars_have_round_lengths(length: float, expected: float) -> None:
 def test_the_scale_bar_has_the_length_that_it_names() -> None:
     plan = GroundPlan(np.zeros(2), np.array([100.0, 100.0]), (500, 500))
     plan.scale_bar(MapLabels())
-    row = plan.image[500 - 18, :200, 0] < 128
+    row = plan.image[500 - 14, :200, 0] < 128
     assert row.sum() == pytest.approx(20 * 5, abs=3)
 
 
 def test_a_png_holds_the_image_and_names_in_any_script_can_be_written() -> None:
-    plan = _plan((400, 200))
+    plan = _plan((700, 200))
     plan.label("Straße 東京.jpg", (10, 100), 0.5)
     legend(plan.image, (4, 40), tuple((kind, RED, kind) for kind in ("dot", "ray", "box", "line", "dash", "cross")))
     assert (plan.image[20:50] != np.array(WHITE)).any()
