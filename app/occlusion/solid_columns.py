@@ -30,14 +30,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.occlusion.kernels import clear_blocked, lower_to_rays
+from app.scene.posed_scene import PosedScene, projection_centers
 
 RAY_GAP = 0.5
 """In columns: how far before its point a ray ends, because the point's depth is uncertain."""
-CLEARANCE = 0.5
+CLEARANCE = 1.5
 """In columns: how far below its lowest ray a column is still free. Rays end at keypoints, and roads have few."""
 REACH = 2
 """In columns: how far around a point columns may be as high as it is."""
-MAX_SOLID = 1.0
+MAX_SOLID = 1.5
 """In columns: what a line of sight may pass of solid, on the ground. A column at a wall is partly free, and keypoints
 lie up to their error behind it."""
 
@@ -74,6 +75,15 @@ class SolidColumns:
         left = seen.copy()
         clear_blocked(left, self.tops_m, self._in_columns(centers), self._in_columns(points), MAX_SOLID)
         return left
+
+    def hold(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """(P,) which points (P, 3) in the world lie inside something solid."""
+        in_columns = self._in_columns(points)
+        cells = np.floor(in_columns[:, :2])
+        inside = np.all((cells >= 0) & (cells < self.tops_m.shape), axis=1)
+        i, j = cells[inside].astype(np.int64).T
+        inside[inside] = in_columns[inside, 2] < self.tops_m[i, j]
+        return inside
 
     def _in_columns(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
         return _in_columns(positions, np.array(self.corner_m), self.column_m)
@@ -112,6 +122,30 @@ def solid_columns(
     lower_to_rays(lowest_free, starts, starts + free[:, None] * (ends - starts))
     tops = np.minimum(lowest_free - CLEARANCE * column_m, _highest_around(highest, REACH))
     return SolidColumns(corner_m=(float(corner[0]), float(corner[1])), column_m=column_m, tops_m=tops)
+
+
+def solid_in_scene(
+    scene: PosedScene, point_rows: NDArray[np.int64], *, bounds_m: NDArray[np.float64], column_m: float
+) -> SolidColumns:
+    """Find what is solid in a rectangle of a scene, from all images that observe the points in it.
+
+    Args:
+        scene: A model with z up.
+        point_rows: Rows of the points in the rectangle; more do no harm.
+        bounds_m: (2, 2) minimum and maximum (x, y) of the rectangle.
+        column_m: Side of the columns.
+    """
+    starts = scene.track_offsets[point_rows]
+    lengths = scene.track_offsets[point_rows + 1] - starts
+    elements = np.repeat(starts - np.cumsum(lengths) + lengths, lengths) + np.arange(lengths.sum())
+    images, image_of_ray = np.unique(scene.track_images[elements], return_inverse=True)
+    return solid_columns(
+        scene.points_in_world[point_rows],
+        np.repeat(np.arange(len(point_rows)), lengths),
+        projection_centers(scene.cam_from_world[images])[image_of_ray],
+        bounds_m=bounds_m,
+        column_m=column_m,
+    )
 
 
 def _in_columns(positions: NDArray[np.float64], corner: NDArray[np.float64], column_m: float) -> NDArray[np.float64]:

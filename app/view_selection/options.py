@@ -17,10 +17,12 @@ class SelectionMethod(StrEnum):
 
 
 class Visibility(StrEnum):
-    """Which images count as seeing a keypoint. Samples are always seen by the images that they project into."""
+    """Which images count as seeing a keypoint. With `tracks`, samples are seen by the images that they project into."""
 
     FRUSTUM = "frustum"
     """Those that it projects into."""
+    OCCLUDED = "occluded"
+    """Those that it projects into, unless something solid stands between; see `app.occlusion`."""
     TRACKS = "tracks"
     """Those in its track. Few images of a video observe the same keypoint, so nearly all of them become necessary."""
 
@@ -33,7 +35,8 @@ class SelectionOptions:
     """`paper` or `optimal`. On a simulated drive (7 cameras, 12,000 images) `optimal` takes 3 % fewer views, from 29
     instead of 14 viewpoints a cluster, with 90 instead of 67 % of the best resolution on the surface."""
     visibility: Visibility = Visibility.FRUSTUM
-    """`frustum` or `tracks`: which images count as seeing a keypoint."""
+    """`frustum`, `occluded` or `tracks`: which images count as seeing a keypoint. `occluded` also judges samples, and
+    leaves out those that no image sees, as they lie inside houses."""
     n_vis: int = 2
     """Views that must see each point, N_vis; [O] section 4.1."""
     n_match: int = 2

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from app.clustering.clusters import Cluster
 from app.clustering.samples import grid_points, sample_axes
 from app.errors import InputError
+from app.occlusion.solid_columns import SolidColumns, solid_in_scene
 from app.scene.point_index import PointIndex
 from app.scene.posed_scene import PosedScene
 from app.view_selection.options import Visibility
@@ -40,6 +41,8 @@ class ViewProblem:
     """(T, 2) keypoint and view, by track; empty where nobody asks for it."""
     samples_in_world: NDArray[np.float64]
     """(S, 3)"""
+    solid: SolidColumns | None = None
+    """What hides points from views; none where nobody asks for it."""
 
 
 class ProblemCutter:
@@ -85,7 +88,14 @@ class ProblemCutter:
             keypoint_normals=scene.point_normals[point_rows].astype(np.float64),
             observations=observations,
             samples_in_world=np.concatenate([grid_points(sample_axes(box, spacing)) for box in boxes]),
+            solid=self._solid(boxes, rows, spacing) if visibility is Visibility.OCCLUDED else None,
         )
+
+    def _solid(self, boxes: NDArray[np.float64], image_rows: NDArray[np.int64], spacing: float) -> SolidColumns:
+        """What is solid in the rectangle around a cluster and its views, also by what other images observe there."""
+        ground = np.concatenate([boxes.reshape(-1, 3), self._centers[image_rows]])[:, :2]
+        bounds = np.stack([ground.min(axis=0), ground.max(axis=0)])
+        return solid_in_scene(self._scene, self._points.rows_between(*bounds), bounds_m=bounds, column_m=spacing)
 
     def _points_in(self, boxes: NDArray[np.float64]) -> NDArray[np.int64]:
         """Rows of the points in a cluster's padded cells, in the order of their coordinates."""

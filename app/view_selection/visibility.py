@@ -42,7 +42,13 @@ class VisiblePoints:
 
 
 def visible_points(problem: ViewProblem, visibility: Visibility) -> VisiblePoints:
-    """Which views see each keypoint and each sample."""
+    """Which views see each keypoint and each sample.
+
+    Raises:
+        ValueError: the problem was cut out for another visibility.
+    """
+    if visibility is Visibility.OCCLUDED:
+        return _unhidden_points(problem)
     if visibility is Visibility.FRUSTUM:
         points = np.concatenate([problem.keypoints_in_world, problem.samples_in_world])
         by_view = frustum_bits(np.ascontiguousarray(points.T), problem.image_from_world, problem.sizes_px)
@@ -52,6 +58,20 @@ def visible_points(problem: ViewProblem, visibility: Visibility) -> VisiblePoint
     tracked[problem.observations[:, 0], problem.observations[:, 1]] = True
     by_point = np.concatenate([pack_rows(tracked), transpose_bits(samples, len(problem.samples_in_world))])
     return VisiblePoints(by_view=transpose_bits(by_point, len(problem.image_names)), by_point=by_point)
+
+
+def _unhidden_points(problem: ViewProblem) -> VisiblePoints:
+    """All keypoints, and the samples that may be on a surface: outside of what is solid, and seen by two views."""
+    if problem.solid is None:
+        raise ValueError(f"cluster {problem.cluster} was cut out without what hides its points")
+    points = np.concatenate([problem.keypoints_in_world, problem.samples_in_world])
+    in_image = frustum_bits(np.ascontiguousarray(points.T), problem.image_from_world, problem.sizes_px)
+    by_view = problem.solid.remove_hidden(in_image, problem.centers_in_world, points)
+    by_point = transpose_bits(by_view, len(points))
+    is_wanted = (np.bitwise_count(by_point).sum(axis=1) >= 2) & ~problem.solid.hold(points)
+    is_wanted[: len(problem.keypoints_in_world)] = True
+    by_point = by_point[is_wanted]
+    return VisiblePoints(by_view=transpose_bits(by_point, len(by_view)), by_point=by_point)
 
 
 def matching_views(visible: VisiblePoints, min_shared_points: int) -> NDArray[np.bool_]:
