@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from app.clustering.grid import Cell, GroundGrid
 from app.clustering.kernels import cameras_with_a_view
-from app.clustering.options import ClusteringOptions
-from app.clustering.samples import height_range, sample_axes
+from app.clustering.options import BlockVisibility, ClusteringOptions
+from app.clustering.samples import grid_points, height_range, sample_axes
+from app.occlusion.solid_columns import solid_in_scene
+from app.scene.kernels import frustum_bits
 from app.scene.point_index import PointIndex
 from app.scene.posed_scene import PosedScene
 from fusion.region import ground_cells
@@ -94,12 +96,45 @@ def associate(scene: PosedScene, options: ClusteringOptions) -> Blocks:
         candidates = candidates[np.hypot(*(centers[candidates, :2] - center).T) <= reach]
         xs, ys, zs = sample_axes(box, options.sample_spacing_m)
         with_view = cameras_with_a_view(around[inside], xs, ys, zs, image_from_world[candidates], sizes_px[candidates])
+        if options.visibility is BlockVisibility.OCCLUDED and with_view.any():
+            rows = candidates[with_view]
+            with_view[with_view] = _with_a_free_view(
+                scene,
+                points,
+                keypoints=around[inside],
+                samples=grid_points((xs, ys, zs)),
+                centers=centers[rows],
+                image_from_world=image_from_world[rows],
+                sizes_px=sizes_px[rows],
+                column_m=options.sample_spacing_m,
+            )
         if not with_view.any():
             dropped.append(DroppedBlock(cell=cell, num_keypoints=count, reason=DropReason.NO_IMAGE))
             continue
         image_rows = candidates[with_view].astype(np.int32)
         kept.append(Block(cells=(cell,), num_keypoints=count, z_range_m=z_range, image_rows=image_rows))
     return Blocks(grid=grid, kept=kept, dropped=dropped, num_far_keypoints=num_far)
+
+
+def _with_a_free_view(
+    scene: PosedScene,
+    points: PointIndex,
+    *,
+    keypoints: NDArray[np.float64],
+    samples: NDArray[np.float64],
+    centers: NDArray[np.float64],
+    image_from_world: NDArray[np.float64],
+    sizes_px: NDArray[np.float64],
+    column_m: float,
+) -> NDArray[np.bool_]:
+    """(n,) which of n images see a keypoint, or a sample outside of what is solid, that nothing solid hides."""
+    ground = np.concatenate([samples, keypoints, centers])[:, :2]
+    bounds = np.stack([ground.min(axis=0), ground.max(axis=0)])
+    solid = solid_in_scene(scene, points.rows_between(*bounds), bounds_m=bounds, column_m=column_m)
+    places = np.concatenate([keypoints, samples[~solid.hold(samples)]])
+    in_image = frustum_bits(np.ascontiguousarray(places.T), image_from_world, sizes_px)
+    free: NDArray[np.bool_] = np.any(solid.remove_hidden(in_image, centers, places), axis=1)
+    return free
 
 
 def _occupied_cells(

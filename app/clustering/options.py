@@ -4,6 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import StrEnum
+
+
+class BlockVisibility(StrEnum):
+    """Which images count as seeing a keypoint or sample of a block."""
+
+    FRUSTUM = "frustum"
+    """Those that it projects into."""
+    OCCLUDED = "occluded"
+    """Those that it projects into, unless something solid stands between; see `app.occlusion`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +41,8 @@ class ClusteringOptions:
     baseline of 2 m and matches good to half a pixel, it is 0.24 m. Also, what is farther away in a street is mostly
     hidden behind houses.
     """
+    visibility: BlockVisibility = BlockVisibility.FRUSTUM
+    """`frustum` or `occluded`: an image joins a block if it sees a keypoint or sample of it in this sense."""
     min_cameras_per_cluster: int = 10
     """Clusters with fewer images are merged into a neighbour; [O] section 3."""
     height_quantiles: tuple[float, float] = (0.01, 0.99)

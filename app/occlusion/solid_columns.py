@@ -80,7 +80,7 @@ class SolidColumns:
         """(P,) which points (P, 3) in the world lie inside something solid."""
         in_columns = self._in_columns(points)
         cells = np.floor(in_columns[:, :2])
-        inside = np.all((cells >= 0) & (cells < self.tops_m.shape), axis=1)
+        inside: NDArray[np.bool_] = np.all((cells >= 0) & (cells < self.tops_m.shape), axis=1)
         i, j = cells[inside].astype(np.int64).T
         inside[inside] = in_columns[inside, 2] < self.tops_m[i, j]
         return inside

@@ -8,43 +8,6 @@ from numpy.typing import NDArray
 
 
 @njit(cache=True)
-def frustum_bits(
-    points: NDArray[np.float64], image_from_world: NDArray[np.float64], sizes_px: NDArray[np.float64]
-) -> NDArray[np.uint64]:
-    """Which points each image shows: those that `sees` says, 64 at a time.
-
-    Args:
-        points: (3, P) in the world, so that the loop over points is vectorised.
-        image_from_world: (N, 3, 4) K [R | t].
-        sizes_px: (N, 2) width, height.
-
-    Returns:
-        (N, ceil(P / 64)) bit ``p % 64`` of word ``p // 64`` stands for point p.
-    """
-    num_points = points.shape[1]
-    bits = np.zeros((len(image_from_world), (num_points + 63) // 64), np.uint64)
-    seen = np.zeros(64, np.uint8)
-    for image in range(len(image_from_world)):
-        m = image_from_world[image]
-        width, height = sizes_px[image, 0], sizes_px[image, 1]
-        for word in range(bits.shape[1]):
-            first = 64 * word
-            count = min(64, num_points - first)
-            for k in range(count):
-                x, y, z = points[0, first + k], points[1, first + k], points[2, first + k]
-                depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-                u = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
-                v = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
-                inside = (depth > 0.0) & (u >= 0.0) & (u < width * depth) & (v >= 0.0) & (v < height * depth)
-                seen[k] = np.uint8(inside)
-            packed = np.uint64(0)
-            for k in range(count):
-                packed |= np.uint64(seen[k]) << np.uint64(k)
-            bits[image, word] = packed
-    return bits
-
-
-@njit(cache=True)
 def transpose_bits(bits: NDArray[np.uint64], num_columns: int) -> NDArray[np.uint64]:
     """(num_columns, ceil(rows / 64)) the transpose of a packed matrix (rows, words).
 

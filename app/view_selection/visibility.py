@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from app.view_selection.kernels import frustum_bits, share_at_least, transpose_bits
+from app.scene.kernels import frustum_bits
+from app.view_selection.kernels import share_at_least, transpose_bits
 from app.view_selection.options import Visibility
 from app.view_selection.problem import ViewProblem
 

@@ -17,21 +17,9 @@ import pytest
 from app.occlusion.kernels import clear_blocked, lower_to_rays
 from app.occlusion.solid_columns import SolidColumns, solid_columns
 from tests.reference import occlusion as plain
+from tests.reference.two_streets import OTHER_STREET, STREET, cameras, facade
 
 BOUNDS_M = np.array([[0.0, 0.0], [30.0, 24.0]])
-STREET, OTHER_STREET = 4.0, 20.0
-
-
-def facade(y: float, height: float = 8.0, spacing: float = 0.8) -> np.ndarray:
-    """Keypoints on a wall along x."""
-    x, z = np.meshgrid(np.arange(0.4, 30, spacing), np.arange(0.3, height + 0.01, spacing))
-    return np.column_stack([x.ravel(), np.full(x.size, y), z.ravel()])
-
-
-def cameras(y: float) -> np.ndarray:
-    """Cameras along a street, 1.7 m high."""
-    x = np.arange(1.0, 30.0, 2.0)
-    return np.column_stack([x, np.full(len(x), y), np.full(len(x), 1.7)])
 
 
 def observed(walls: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -11,6 +11,7 @@ from app.clustering.kernels import cameras_with_a_view
 from app.clustering.samples import grid_points
 from app.scene.kernels import (
     decode_tracks,
+    frustum_bits,
     gather_bytes,
     gather_names,
     gather_tracks,
@@ -21,7 +22,6 @@ from app.scene.kernels import (
 from app.scene.submodel import write_submodel
 from app.view_selection.kernels import (
     count_distinct,
-    frustum_bits,
     resolution_on_surface,
     share_at_least,
     transpose_bits,
