@@ -13,6 +13,7 @@ from app.command_line import (
     VerboseOption,
     WorkspaceArgument,
     load_config,
+    print_lines,
     run_safely,
     stage_command,
 )
@@ -227,8 +228,7 @@ def explain(
     from app.workspace import Workspace
 
     def work() -> None:
-        for line in explain_clusters(Workspace(workspace.absolute()), clusters or [], draw_all=pictures):
-            typer.echo(line)
+        print_lines(explain_clusters(Workspace(workspace.absolute()), clusters or [], draw_all=pictures))
 
     run_safely(work, verbosity=int(verbose))
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import functools
 import inspect
 import logging
+import os
 import signal
 import sys
 import time
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Concatenate, ParamSpec
@@ -111,6 +112,17 @@ def run_safely(work: Callable[[], None], *, verbosity: int) -> None:
     except KeyboardInterrupt:
         logger.warning("stopped; the same command continues")
         raise typer.Exit(130) from None
+
+
+def print_lines(lines: Iterable[str]) -> None:
+    """Print until there is no more, or until who reads it, such as `head`, has seen enough."""
+    try:
+        for line in lines:
+            typer.echo(line)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # What is left in the buffer would raise again at the end of the program.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _fail(error: Exception, code: int) -> None:

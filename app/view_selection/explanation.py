@@ -148,7 +148,9 @@ def explain_selection(
     scarce = count_views(visible[critical] & packed_usable) <= n_vis
     seen = unpack_rows(visible[critical] & packed_selected, len(selected))[:, views]
     among = matches[np.ix_(views, views)]
-    held = among & (among.sum(axis=0) <= n_match)
+    held_views: list[list[int]] = [[] for _ in views]
+    for place, other in np.argwhere(among & (among.sum(axis=0) <= n_match)).tolist():
+        held_views[place].append(other)
     covered = np.stack([count_views(visible) >= n_vis, num_selected_seeing >= n_vis])
     return Explanation(
         n_vis=n_vis,
@@ -158,7 +160,7 @@ def explain_selection(
         forced=tuple(forced[views].tolist()),
         scarce_points=tuple(seen[scarce].sum(axis=0).tolist()),
         critical_points=tuple(seen.sum(axis=0).tolist()),
-        held_views=tuple(tuple(np.flatnonzero(row).tolist()) for row in held),
+        held_views=tuple(map(tuple, held_views)),
         fills_min_views=len(views) <= min_views,
         added_quality=(0.0,) * len(views) if worth is None else _added_quality(views, worth),
     )

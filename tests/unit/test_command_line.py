@@ -93,3 +93,15 @@ def test_a_terminated_run_says_so_in_one_line() -> None:
     result = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True, cwd=ROOT)
     assert result.returncode == 130
     assert result.stderr == "warning: stopped; the same command continues\n"
+
+
+def test_a_reader_that_has_seen_enough_ends_a_table_quietly() -> None:
+    script = "from app.command_line import print_lines; print_lines(str(k) for k in range(100_000))"
+    result = subprocess.run(
+        ["bash", "-o", "pipefail", "-c", f"{sys.executable} -c '{script}' | head -n 2"],
+        check=False,
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+    )
+    assert (result.returncode, result.stdout, result.stderr) == (0, "0\n1\n", "")
