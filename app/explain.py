@@ -9,9 +9,10 @@ from pathlib import Path
 from app.clustering.clusters import Cluster, Clustering
 from app.errors import InputError
 from app.scene.read_model import open_scene
-from app.stage import finished_product
+from app.stage import finished_record
 from app.stages import map_labels
 from app.view_selection.describe import describe_selection, tabulate_selections
+from app.view_selection.options import Visibility
 from app.view_selection.picture import write_pictures
 from app.view_selection.problem import ProblemCutter
 from app.view_selection.selection import Selection, read_selections
@@ -34,15 +35,15 @@ def explain(workspace: Workspace, names: Sequence[str], *, draw_all: bool = Fals
         InputError: nothing was selected yet, or a cluster has another name.
     """
     folder = workspace.root / "selection"
-    finished_product(folder, "select")
+    visibility = Visibility(finished_record(folder, "select").options["visibility"])
     clusters = Clustering.read(workspace.root / "clusters").clusters
     if not names:
         yield from tabulate_selections(read_selections(folder))
         if draw_all:
-            yield _draw(workspace, zip(clusters, read_selections(folder), strict=True))
+            yield _draw(workspace, zip(clusters, read_selections(folder), strict=True), visibility)
         return
     numbers, selections = _named(folder, names)
-    where = _draw(workspace, ((clusters[numbers[name]], selections[name]) for name in names))
+    where = _draw(workspace, ((clusters[numbers[name]], selections[name]) for name in names), visibility)
     yield from (describe_selection(selections[name]) for name in names)
     yield where
 
@@ -61,7 +62,7 @@ def _named(folder: Path, names: Sequence[str]) -> tuple[dict[str, int], dict[str
     return numbers, selections
 
 
-def _draw(workspace: Workspace, found: Iterable[tuple[Cluster, Selection]]) -> str:
-    folder = workspace.root / "selection" / PICTURES_FOLDER
-    write_pictures(ProblemCutter(open_scene(workspace.scene)), found, folder, map_labels(workspace))
+def _draw(workspace: Workspace, found: Iterable[tuple[Cluster, Selection]], visibility: Visibility) -> str:
+    folder, cutter = workspace.root / "selection" / PICTURES_FOLDER, ProblemCutter(open_scene(workspace.scene))
+    write_pictures(cutter, found, folder, visibility=visibility, labels=map_labels(workspace))
     return f"pictures: {folder}"

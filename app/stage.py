@@ -155,8 +155,8 @@ def is_current(folder: Path, *, options: object, inputs: Mapping[str, str]) -> b
     return record is not None and record.fingerprint == digest(_as_json(options), dict(inputs), FORMAT_VERSION)
 
 
-def finished_product(folder: Path, command: str) -> str:
-    """Product digest of a stage that must have been run.
+def finished_record(folder: Path, command: str) -> StageRecord:
+    """The record of a stage that must have been run.
 
     Raises:
         InputError: it hasn't.
@@ -164,7 +164,16 @@ def finished_product(folder: Path, command: str) -> str:
     record = StageRecord.read(folder)
     if record is None:
         raise InputError(f"{folder} is missing or unfinished; run `cityrecon {command}` first")
-    return record.product
+    return record
+
+
+def finished_product(folder: Path, command: str) -> str:
+    """Product digest of a stage that must have been run.
+
+    Raises:
+        InputError: it hasn't.
+    """
+    return finished_record(folder, command).product
 
 
 def _replace(partial: Path, folder: Path) -> None:

@@ -112,7 +112,7 @@ def figure(scene: PosedScene, clusters: list[Cluster]) -> Image:
         parts = [titled(panel, title) for panel, title in zip((before, after), titles, strict=True)]
         columns += [blank(GAP_PX, 2 * parts[0].shape[0]), np.concatenate(parts)]
     body = np.concatenate(columns[1:], axis=1)
-    return np.concatenate([body, legend_of_panels(body.shape[1], TEXT_SCALE)])
+    return np.concatenate([body, legend_of_panels(body.shape[1], text_scale=TEXT_SCALE)])
 
 
 def titled(panel: Image, title: str) -> Image:

@@ -38,13 +38,19 @@ _PANEL_PX, _GAP_PX, _HEAD_PX, _LINE_PX = 560, 12, 92, 22
 _MARGIN = 0.04
 _MIN_SPAN = 1e-3
 _RAY_PX = 17.0
-_PADDED: Color = (250, 246, 240)
+_PADDED: Color = (247, 239, 231)
+SOLID: Color = (222, 216, 208)
 NOT_NEEDED: Color = (50, 150, 245)
 _NEEDED = {Reason.SCARCE, Reason.COVERS, Reason.MATCHES}
 
 
 def write_pictures(
-    cutter: ProblemCutter, found: Iterable[tuple[Cluster, Selection]], folder: Path, labels: MapLabels
+    cutter: ProblemCutter,
+    found: Iterable[tuple[Cluster, Selection]],
+    folder: Path,
+    *,
+    visibility: Visibility,
+    labels: MapLabels,
 ) -> None:
     """Draw some clusters into ``CLUSTER.png`` files.
 
@@ -52,11 +58,12 @@ def write_pictures(
         cutter: Of the scene that was clustered.
         found: Clusters and their selections.
         folder: For the files; is made.
+        visibility: By which the views were selected; with `occluded`, what hides points is drawn.
         labels: Of the world's axes.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for cluster, selection in found:
-        picture = encode_png(draw_selection(cutter.problem(cluster, Visibility.FRUSTUM), cluster, selection, labels))
+        picture = encode_png(draw_selection(cutter.problem(cluster, visibility), cluster, selection, labels))
         with atomic_file(folder / f"{cluster.name}.png") as path:
             path.write_bytes(picture)
 
@@ -76,7 +83,8 @@ def draw_selection(problem: ViewProblem, cluster: Cluster, selection: Selection,
     before, after = draw_panels(problem, cluster, selection, labels)
     gap = blank(_GAP_PX, _PANEL_PX)
     body = np.concatenate([gap, before, gap, after, gap], axis=1)
-    return np.concatenate([_head(selection, body.shape[1]), body, _foot(selection, body.shape[1])])
+    symbols = legend_of_panels(body.shape[1], shows_solid=problem.solid is not None)
+    return np.concatenate([_head(selection, body.shape[1]), body, symbols, _foot(selection, body.shape[1])])
 
 
 def draw_panels(problem: ViewProblem, cluster: Cluster, selection: Selection, labels: MapLabels) -> tuple[Image, Image]:
@@ -105,6 +113,10 @@ def _ground(problem: ViewProblem, cluster: Cluster) -> GroundPlan:
     half = max(float((high - low).max()) / 2, _MIN_SPAN) * (1 + 2 * _MARGIN)
     plan = GroundPlan((low + high) / 2 - half, (low + high) / 2 + half, (_PANEL_PX, _PANEL_PX), SCALE_BAR_PX)
     plan.boxes(boxes, _PADDED)
+    if problem.solid is not None:
+        hides = problem.solid.tops_m > np.median(problem.centers_in_world[:, 2])
+        lower = np.argwhere(hides) * problem.solid.column_m + problem.solid.corner_m
+        plan.boxes(np.stack([lower, lower + problem.solid.column_m], axis=1), SOLID)
     plan.dots(problem.keypoints_in_world, 1.1, BLUE, 0.8)
     sides = outline(cluster.cells) * np.array(cluster.grid.block_size_m) + cluster.grid.origin_m
     plan.dashed_lines(sides, INK, 2)
@@ -140,24 +152,25 @@ def _head(selection: Selection, width: int) -> Image:
 
 
 def _foot(selection: Selection, width: int) -> Image:
-    if not selection.relaxed:
-        return legend_of_panels(width)
-    bar = blank(width, _LINE_PX)
-    write(bar, f"Relaxed: {'; '.join(selection.relaxed)}", (_GAP_PX, 14), 0.42, GREY)
-    return np.concatenate([legend_of_panels(width), bar])
+    bar = blank(width, _LINE_PX if selection.relaxed else 0)
+    if selection.relaxed:
+        write(bar, f"Relaxed: {'; '.join(selection.relaxed)}", (_GAP_PX, 14), 0.42, GREY)
+    return bar
 
 
 @cache
-def legend_of_panels(width: int, text_scale: float = 0.42) -> Image:
+def legend_of_panels(width: int, *, shows_solid: bool = False, text_scale: float = 0.42) -> Image:
     """What the symbols mean."""
     bar = blank(width, 3 * _LINE_PX // 2)
-    entries = (
+    entries = [
         ("dash", INK, "cells"),
         ("box", _PADDED, "overlap"),
         ("dot", BLUE, "keypoint"),
         ("ray", RED, "view (after: needed by a point or a match)"),
         ("ray", NOT_NEEDED, "other selected view"),
         ("dot", LIGHT_GREY, "view that is not selected"),
-    )
+    ]
+    if shows_solid:
+        entries.append(("box", SOLID, "solid, higher than the views"))
     legend(bar, (_GAP_PX, _LINE_PX), entries, text_scale)
     return bar

@@ -97,7 +97,13 @@ def select(
     }
     (output_dir / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     found = ((reader.clusters[number], selection) for number, selection in to_draw)
-    write_pictures(reader.cutter, found, output_dir / PICTURES_FOLDER, labels or MapLabels())
+    write_pictures(
+        reader.cutter,
+        found,
+        output_dir / PICTURES_FOLDER,
+        visibility=options.visibility,
+        labels=labels or MapLabels(),
+    )
     logger.info(
         "%d images selected for %d clusters: %.1f images per cluster, %.2f clusters per image",
         totals["selected"],

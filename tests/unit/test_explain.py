@@ -17,6 +17,7 @@ from app.config import RunConfig, update_config
 from app.errors import InputError
 from app.explain import explain
 from app.georegister.georeference import Georeference, GravitySource, ScaleSource
+from app.occlusion.solid_columns import SolidColumns
 from app.run import Run
 from app.scene.posed_scene import PosedScene
 from app.scene.submodel import write_submodel
@@ -25,7 +26,7 @@ from app.stages import cluster_stage, select_stage
 from app.view_selection.describe import describe_selection, describe_view
 from app.view_selection.explanation import Coverage, Explanation
 from app.view_selection.options import SelectionOptions, Visibility
-from app.view_selection.picture import NOT_NEEDED, draw_panels, draw_selection
+from app.view_selection.picture import NOT_NEEDED, SOLID, draw_panels, draw_selection
 from app.view_selection.problem import ProblemCutter
 from app.view_selection.selection import Selection, read_selections, select_views
 from app.workspace import Workspace
@@ -135,7 +136,7 @@ def test_the_command_explains_named_clusters_or_tabulates_all(tmp_path: Path) ->
 
 
 def test_the_stage_draws_some_clusters_and_the_command_any(tmp_path: Path) -> None:
-    settings = {"clustering": {"sample_spacing_m": 4.0}, "selection": {"max_pictures": 2}}
+    settings = {"clustering": {"sample_spacing_m": 4.0}, "selection": {"max_pictures": 2, "visibility": "occluded"}}
     workspace = _selected(random_scene(5), tmp_path / "ws", **settings)
     names = [selection.cluster for selection in read_selections(workspace.root / "selection")]
     pictures = workspace.root / "selection" / "pictures"
@@ -197,3 +198,10 @@ def test_a_picture_shows_all_views_before_and_the_selected_ones_after() -> None:
     assert _count(before, NOT_NEEDED) == 0
     whole = draw_selection(problem, cluster, selection, MapLabels())
     assert _count(whole, NOT_NEEDED) > _count(after, NOT_NEEDED)
+    assert _count(whole, SOLID) == 0
+
+    solid = SolidColumns(corner_m=(10.0, 10.0), column_m=2.0, tops_m=np.array([[9.0, 1.0], [-np.inf, -np.inf]]))
+    before, after = draw_panels(replace(problem, solid=solid), cluster, selection, MapLabels())
+    rows, columns = np.nonzero(np.all(before == SOLID, axis=-1))
+    assert len(rows) == (np.ptp(rows) + 1) * (np.ptp(columns) + 1)
+    assert _count(after, SOLID) == len(rows) > 20
