@@ -13,7 +13,7 @@ from app.stage import finished_record
 from app.stages import map_labels
 from app.view_selection.describe import describe_selection, tabulate_selections
 from app.view_selection.options import Visibility
-from app.view_selection.picture import write_pictures
+from app.view_selection.picture import write_picture
 from app.view_selection.problem import ProblemCutter
 from app.view_selection.selection import Selection, read_selections
 from app.view_selection.stage import PICTURES_FOLDER
@@ -63,6 +63,8 @@ def _named(folder: Path, names: Sequence[str]) -> tuple[dict[str, int], dict[str
 
 
 def _draw(workspace: Workspace, found: Iterable[tuple[Cluster, Selection]], visibility: Visibility) -> str:
-    folder, cutter = workspace.root / "selection" / PICTURES_FOLDER, ProblemCutter(open_scene(workspace.scene))
-    write_pictures(cutter, found, folder, visibility=visibility, labels=map_labels(workspace))
+    folder, labels = workspace.root / "selection" / PICTURES_FOLDER, map_labels(workspace)
+    cutter = ProblemCutter(open_scene(workspace.scene))
+    for cluster, selection in found:
+        write_picture(folder, cutter.problem(cluster, visibility), cluster, selection, labels)
     return f"pictures: {folder}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
@@ -29,8 +28,7 @@ from app.clustering.ground_plan import (
 )
 from app.view_selection.describe import percent
 from app.view_selection.explanation import Reason
-from app.view_selection.options import Visibility
-from app.view_selection.problem import ProblemCutter, ViewProblem
+from app.view_selection.problem import ViewProblem
 from app.view_selection.selection import Selection
 from app.workspace import atomic_file
 
@@ -44,35 +42,20 @@ NOT_NEEDED: Color = (50, 150, 245)
 _NEEDED = {Reason.SCARCE, Reason.COVERS, Reason.MATCHES}
 
 
-def write_pictures(
-    cutter: ProblemCutter,
-    found: Iterable[tuple[Cluster, Selection]],
-    folder: Path,
-    *,
-    visibility: Visibility,
-    labels: MapLabels,
+def write_picture(
+    folder: Path, problem: ViewProblem, cluster: Cluster, selection: Selection, labels: MapLabels
 ) -> None:
-    """Draw some clusters into ``CLUSTER.png`` files.
-
-    Args:
-        cutter: Of the scene that was clustered.
-        found: Clusters and their selections.
-        folder: For the files; is made.
-        visibility: By which the views were selected; with `occluded`, what hides points is drawn.
-        labels: Of the world's axes.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    for cluster, selection in found:
-        picture = encode_png(draw_selection(cutter.problem(cluster, visibility), cluster, selection, labels))
-        with atomic_file(folder / f"{cluster.name}.png") as path:
-            path.write_bytes(picture)
+    """Write :func:`draw_selection` to ``CLUSTER.png`` in a folder, which is made."""
+    picture = encode_png(draw_selection(problem, cluster, selection, labels))
+    with atomic_file(folder / f"{cluster.name}.png") as path:
+        path.write_bytes(picture)
 
 
 def draw_selection(problem: ViewProblem, cluster: Cluster, selection: Selection, labels: MapLabels) -> Image:
     """Draw a cluster with all of its views beside the same with the selected ones, with title and legend.
 
     Args:
-        problem: The cluster's views and keypoints.
+        problem: The cluster's views and keypoints, and what hides points from views, where selection knows it.
         cluster: Its cells.
         selection: Of its views.
         labels: Of the world's axes.

@@ -20,7 +20,7 @@ from app.executor import die_with_parent
 from app.scene.read_model import open_scene
 from app.view_selection.explanation import ExplanationSums
 from app.view_selection.options import SelectionOptions
-from app.view_selection.picture import write_pictures
+from app.view_selection.picture import write_picture
 from app.view_selection.problem import ProblemCutter
 from app.view_selection.selection import Selection, select_views, write_selections
 
@@ -56,18 +56,16 @@ def select(
     Raises:
         InputError: the clusters can't be read, or don't belong to the model beside them.
     """
-    reader = _ClusterReader(clusters_dir)
-    num_images, num_clusters = len(reader.scene.image_names), len(reader.clusters)
+    selector = _Selector(clusters_dir, output_dir / PICTURES_FOLDER, options, labels or MapLabels())
+    num_images, num_clusters = len(selector.scene.image_names), len(selector.clusters)
     num_workers = max(1, min(num_workers, num_clusters // _MIN_CLUSTERS_PER_WORKER))
     totals = Counter[str]()
     explained = ExplanationSums()
     gaps: dict[str, dict[str, float]] = {}
     empty: list[str] = []
-    drawn = _spread(num_clusters, options.max_pictures)
-    to_draw: list[tuple[int, Selection]] = []
 
     def counted() -> Iterator[Selection]:
-        for done, selection in enumerate(_solved(reader, options, num_workers), start=1):
+        for done, selection in enumerate(_solved(selector, num_workers), start=1):
             totals["selected"] += len(selection.image_names)
             totals["relaxed"] += bool(selection.relaxed)
             explained.add(selection.explanation)
@@ -75,8 +73,6 @@ def select(
                 gaps[selection.cluster] = {"size": selection.size_gap, "quality": selection.quality_gap}
             if not selection.image_names:
                 empty.append(selection.cluster)
-            if done - 1 in drawn:
-                to_draw.append((done - 1, selection))
             if progress is not None:
                 progress(done, num_clusters)
             yield selection
@@ -96,14 +92,6 @@ def select(
         "clusters_without_stereo_pair": empty,
     }
     (output_dir / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    found = ((reader.clusters[number], selection) for number, selection in to_draw)
-    write_pictures(
-        reader.cutter,
-        found,
-        output_dir / PICTURES_FOLDER,
-        visibility=options.visibility,
-        labels=labels or MapLabels(),
-    )
     logger.info(
         "%d images selected for %d clusters: %.1f images per cluster, %.2f clusters per image",
         totals["selected"],
@@ -117,63 +105,71 @@ def select(
         logger.warning("cluster %s has no two views that match: it stays empty", name)
 
 
+class _Selector:
+    """Selects the views of a folder's clusters, and draws some; each process has one of its own."""
+
+    def __init__(self, clusters_dir: Path, pictures_dir: Path, options: SelectionOptions, labels: MapLabels) -> None:
+        self.arguments = (clusters_dir, pictures_dir, options, labels)
+        self.clusters = Clustering.read(clusters_dir).clusters
+        self.scene = open_scene(clusters_dir / SCENE_FOLDER)
+        self._cutter = ProblemCutter(self.scene)
+        self._drawn = _spread(len(self.clusters), options.max_pictures)
+
+    def select(self, batch: range) -> list[Selection]:
+        return [self._select(number) for number in batch]
+
+    def _select(self, number: int) -> Selection:
+        _, pictures_dir, options, labels = self.arguments
+        cluster = self.clusters[number]
+        problem = self._cutter.problem(cluster, options.visibility)
+        selection = select_views(problem, options)
+        if number in self._drawn:
+            write_picture(pictures_dir, problem, cluster, selection, labels)
+        return selection
+
+
 def _spread(num_clusters: int, max_chosen: int) -> set[int]:
     """At most so many of the clusters' numbers, evenly spread."""
     count = min(max_chosen, num_clusters)
     return {number * num_clusters // count for number in range(count)}
 
 
-class _ClusterReader:
-    """The clusters of a folder and their problems; each process has one of its own."""
-
-    def __init__(self, clusters_dir: Path) -> None:
-        self.folder = clusters_dir
-        self.clusters = Clustering.read(clusters_dir).clusters
-        self.scene = open_scene(clusters_dir / SCENE_FOLDER)
-        self.cutter = ProblemCutter(self.scene)
-
-    def select(self, batch: range, options: SelectionOptions) -> list[Selection]:
-        return [
-            select_views(self.cutter.problem(self.clusters[number], options.visibility), options) for number in batch
-        ]
-
-
-_reader: _ClusterReader
+_selector: _Selector
 """Of a worker process."""
 
 
-def _start_worker(parent: int, clusters_dir: Path) -> None:
-    global _reader
+def _start_worker(parent: int, *arguments: Any) -> None:
+    global _selector
     die_with_parent(parent)
-    _reader = _ClusterReader(clusters_dir)
+    _selector = _Selector(*arguments)
 
 
-def _select_in_worker(batch: range, options: SelectionOptions) -> list[Selection]:
-    return _reader.select(batch, options)
+def _select_in_worker(batch: range) -> list[Selection]:
+    return _selector.select(batch)
 
 
-def _solved(reader: _ClusterReader, options: SelectionOptions, num_workers: int) -> Iterator[Selection]:
+def _solved(selector: _Selector, num_workers: int) -> Iterator[Selection]:
     """Selections in the order of the clusters, with few of them in memory.
 
     This process does what no worker has begun: they need a while to start.
     """
-    total = len(reader.clusters)
+    total = len(selector.clusters)
     batches = iter([range(first, min(first + _BATCH, total)) for first in range(0, total, _BATCH)])
     if num_workers == 1:
         for batch in batches:
-            yield from reader.select(batch, options)
+            yield from selector.select(batch)
         return
     with ProcessPoolExecutor(
         num_workers,
         multiprocessing.get_context("spawn"),
         initializer=_start_worker,
-        initargs=(os.getpid(), reader.folder),
+        initargs=(os.getpid(), *selector.arguments),
     ) as executor:
         running = deque[tuple[range, Future[list[Selection]]]]()
         while True:
             for batch in islice(batches, 3 * num_workers - len(running)):
-                running.append((batch, executor.submit(_select_in_worker, batch, options)))
+                running.append((batch, executor.submit(_select_in_worker, batch)))
             if not running:
                 return
             batch, future = running.popleft()
-            yield from reader.select(batch, options) if future.cancel() else future.result()
+            yield from selector.select(batch) if future.cancel() else future.result()

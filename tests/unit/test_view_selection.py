@@ -194,7 +194,9 @@ def test_stage_does_not_depend_on_the_number_of_workers(tmp_path: Path, monkeypa
     total = len(clustering.clusters)
     assert total > 2
     assert steps == [(done, total) for done in range(1, total + 1)] * 2
-    for name in ("selection.jsonl", "report.json"):
+    names = sorted(path.relative_to(tmp_path / "1") for path in (tmp_path / "1").rglob("*.*"))
+    assert len(names) == 2 + total
+    for name in names:
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
     selections = list(read_selections(tmp_path / "1"))
     assert [s.cluster for s in selections] == [c.name for c in clustering.clusters]
