@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -113,7 +113,7 @@ def smallest_selection(program: ViewProgram, preference: NDArray[np.float64], ma
     selected = greedy_selection(program, preference)
     bound = max(program.min_views, int(program.fixed.sum()))
     if selected.sum() > bound:
-        found, objective_bound = _solve(_size_model(program), program, max_nodes)
+        found, objective_bound = _solve(program, _best_seeing(program, preference), bound, _size_model, max_nodes)
         bound = max(bound, int(np.ceil(objective_bound - _TOLERANCE)))
         if found is not None and found.sum() < selected.sum():
             selected = found
@@ -138,7 +138,14 @@ def best_selection(
         max_nodes: Limit of the solver.
     """
     size = int(smallest.selected.sum())
-    found, objective_bound = _solve(_quality_model(program, worth, size), program, max_nodes)
+    spread = _best_spread(program, worth, size)
+    found, objective_bound = _solve(
+        program,
+        spread,
+        total_quality(spread, worth),
+        lambda program: _quality_model(program, worth, size),
+        max_nodes,
+    )
     candidates = [smallest.selected] if found is None else [found, smallest.selected]
     selected = max(candidates, key=lambda candidate: total_quality(candidate, worth))
     total = total_quality(selected, worth)
@@ -231,23 +238,62 @@ def _quality_model(program: ViewProgram, worth: ViewQuality, size: int) -> _Mode
     return model
 
 
-def _solve(model: _Model, program: ViewProgram, max_nodes: int) -> tuple[NDArray[np.bool_] | None, float]:
-    """The best selection that the solver finds, if any, and its bound on the objective.
+def _best_seeing(program: ViewProgram, preference: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """A smallest selection without covering and matching constraints."""
+    selected = program.fixed.copy()
+    order = np.lexsort((-preference, ~(program.usable & ~selected)))
+    selected[order[: max(0, program.min_views - int(selected.sum()))]] = True
+    return selected
 
-    Matching constraints are many, dense and seldom active, so a view's joins the model once a solution without it
-    violates it; the result is the same.
+
+def _best_spread(program: ViewProgram, worth: ViewQuality, size: int) -> NDArray[np.bool_]:
+    """The selection of a size with the best total quality without covering and matching constraints.
+
+    Taking the greatest gain again and again is optimal here, as a viewpoint's first view gains the most: its best one.
     """
-    for row, bound in zip(program.views_of_rows, program.rows.bounds.tolist(), strict=True):
-        views = np.flatnonzero(row).tolist()
-        model.constrain(views, [1.0] * len(views), bound)
+    selected = program.fixed.copy()
+    best_there = np.zeros(int(worth.viewpoint.max(initial=-1)) + 1)
+    np.maximum.at(best_there, worth.viewpoint[selected], worth.quality[selected])
+    for _ in range(size - int(selected.sum())):
+        gain = np.maximum(worth.quality - best_there[worth.viewpoint], 0.0)
+        view = int(np.argmax(np.where(program.usable & ~selected, gain, -1.0)))
+        selected[view] = True
+        best_there[worth.viewpoint[view]] = max(best_there[worth.viewpoint[view]], worth.quality[view])
+    return selected
+
+
+def _solve(
+    program: ViewProgram,
+    selected: NDArray[np.bool_],
+    objective_bound: float,
+    make_model: Callable[[ViewProgram], _Model],
+    max_nodes: int,
+) -> tuple[NDArray[np.bool_] | None, float]:
+    """The best selection that the solver finds, if any, and a bound on the objective.
+
+    Covering and matching constraints are many and few of them active. So each joins the model once the best selection
+    without it violates it; the result is the same, often without any call of the solver.
+
+    Args:
+        program: What to meet.
+        selected: (N_c,) the best selection without these constraints.
+        objective_bound: Its objective.
+        make_model: The model without these constraints.
+        max_nodes: Limit of each call.
+    """
+    model = None
     while True:
+        uncovered, unmatched = program.missing(selected)
+        if not uncovered.any() and not unmatched.any():
+            return selected, objective_bound
+        model = make_model(program) if model is None else model
+        for row in np.flatnonzero(uncovered):
+            views = np.flatnonzero(program.views_of_rows[row]).tolist()
+            model.constrain(views, [1.0] * len(views), float(program.rows.bounds[row]))
+        for view in np.flatnonzero(unmatched).tolist():
+            partners = np.flatnonzero(program.matches[view] & program.usable).tolist()
+            model.constrain([*partners, view], [*[1.0] * len(partners), -float(program.n_match)], 0.0)
         values, objective_bound = model.solve(max_nodes)
         if values is None:
             return None, objective_bound
         selected = values[: len(program.usable)] > 0.5
-        unmatched = np.flatnonzero(program.missing(selected)[1]).tolist()
-        if not unmatched:
-            return selected if program.is_met_by(selected) else None, objective_bound
-        for view in unmatched:
-            partners = np.flatnonzero(program.matches[view] & program.usable).tolist()
-            model.constrain([*partners, view], [*[1.0] * len(partners), -float(program.n_match)], 0.0)
