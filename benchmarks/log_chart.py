@@ -1,0 +1,63 @@
+"""A chart with logarithmic axes, as SVG."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+_WIDTH, _HEIGHT = 720, 420
+_LEFT, _RIGHT, _TOP, _BOTTOM = 70, 170, 20, 50
+_COLORS = ("#0b5394", "#cc4125", "#6aa84f", "#8e7cc3", "#b45f06")
+
+
+def write_log_chart(
+    path: Path, series: dict[str, Sequence[tuple[float, float]]], *, x_title: str, y_title: str
+) -> None:
+    """Write lines of (x, y), both positive, over powers of ten."""
+    xs = [x for line in series.values() for x, _ in line]
+    ys = [y for line in series.values() for _, y in line]
+    x_range, y_range = _decades(xs), _decades(ys)
+
+    def place(x: float, y: float) -> tuple[float, float]:
+        across = (math.log10(x) - x_range[0]) / (x_range[1] - x_range[0])
+        up = (math.log10(y) - y_range[0]) / (y_range[1] - y_range[0])
+        return _LEFT + across * (_WIDTH - _LEFT - _RIGHT), _HEIGHT - _BOTTOM - up * (_HEIGHT - _TOP - _BOTTOM)
+
+    parts = []
+    for power in range(x_range[0], x_range[1] + 1):
+        x, bottom = place(10.0**power, 10.0 ** y_range[0])
+        parts.append(f'<line x1="{x:.1f}" y1="{_TOP}" x2="{x:.1f}" y2="{bottom:.1f}" stroke="#ddd"/>')
+        parts.append(f'<text x="{x:.1f}" y="{bottom + 18:.1f}" text-anchor="middle">{10.0**power:,g}</text>')
+    for power in range(y_range[0], y_range[1] + 1):
+        left, y = place(10.0 ** x_range[0], 10.0**power)
+        parts.append(f'<line x1="{left:.1f}" y1="{y:.1f}" x2="{_WIDTH - _RIGHT}" y2="{y:.1f}" stroke="#ddd"/>')
+        parts.append(f'<text x="{left - 8:.1f}" y="{y + 4:.1f}" text-anchor="end">{10.0**power:,g}</text>')
+    for (name, line), color in zip(series.items(), _COLORS, strict=False):
+        if not line:
+            continue
+        places = [place(x, y) for x, y in line]
+        corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
+        parts.append(f'<polyline points="{corners}" fill="none" stroke="{color}" stroke-width="2"/>')
+        parts.extend(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="{color}"/>' for x, y in places)
+        x, y = places[-1]
+        parts.append(f'<text x="{x + 8:.1f}" y="{y + 4:.1f}" fill="{color}">{escape(name)}</text>')
+    middle_x, middle_y = (_LEFT + _WIDTH - _RIGHT) / 2, (_TOP + _HEIGHT - _BOTTOM) / 2
+    parts.append(f'<text x="{middle_x}" y="{_HEIGHT - 10}" text-anchor="middle">{escape(x_title)}</text>')
+    parts.append(
+        f'<text transform="translate(16 {middle_y}) rotate(-90)" text-anchor="middle">{escape(y_title)}</text>'
+    )
+    path.write_text(
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {_HEIGHT}" font-family="sans-serif"'
+        f' font-size="13">\n<rect width="{_WIDTH}" height="{_HEIGHT}" fill="white"/>\n'
+        + "\n".join(parts)
+        + "\n</svg>\n",
+        encoding="utf-8",
+    )
+
+
+def _decades(values: Sequence[float]) -> tuple[int, int]:
+    """Powers of ten around all values."""
+    low, high = math.floor(math.log10(min(values))), math.ceil(math.log10(max(values)))
+    return low, max(high, low + 1)
