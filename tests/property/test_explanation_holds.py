@@ -146,14 +146,29 @@ def test_selections_of_scenes_are_explained_by_what_their_views_see(seed: int, m
         found = select_views(problem, SelectionOptions(method=method, n_low=3, n_high=6, min_shared_points=3))
         explanation = found.explanation
         selected = np.isin(problem.image_names, found.image_names)
-        for coverage, points in (
-            (explanation.keypoints, problem.keypoints_in_world),
-            (explanation.samples, problem.samples_in_world),
+        points = np.concatenate([problem.keypoints_in_world, problem.samples_in_world])
+        seen = plain.visibility_matrix(points, problem.image_from_world, problem.sizes_px)
+        num_keypoints = len(problem.keypoints_in_world)
+        for coverage, rows in (
+            (explanation.keypoints, seen[:num_keypoints]),
+            (explanation.samples, seen[num_keypoints:]),
         ):
-            seen = plain.visibility_matrix(points, problem.image_from_world, problem.sizes_px)
-            assert coverage.total == len(points)
-            assert coverage.before == (seen.sum(axis=1) >= 2).sum()
-            assert coverage.after == (seen[:, selected].sum(axis=1) >= 2).sum()
+            assert coverage.total == len(rows)
+            assert coverage.before == (rows.sum(axis=1) >= 2).sum()
+            assert coverage.after == (rows[:, selected].sum(axis=1) >= 2).sum()
+        unmatched = [names for reason, names in found.not_selected.items() if reason.startswith("matches fewer")]
+        usable = ~np.isin(problem.image_names, [name for names in unmatched for name in names])
+        num_usable = seen[:, usable].sum(axis=1)
+        bounds = np.minimum(num_usable, 2)
+        matches = plain.share_at_least([set(np.flatnonzero(column).tolist()) for column in seen.T], 3)
+        for place, view in enumerate(np.flatnonzero(selected)):
+            without = selected & (np.arange(len(selected)) != view)
+            missing = seen[:, without].sum(axis=1) < bounds
+            assert explanation.critical_points[place] == missing.sum()
+            assert explanation.scarce_points[place] == (missing & (num_usable <= 2)).sum()
+            lonely = without & ((matches & without).sum(axis=1) < explanation.n_match)
+            held = [found.image_names[other] for other in explanation.held_views[place]]
+            assert held == [problem.image_names[other] for other in np.flatnonzero(lonely)]
         reasons = [explanation.reasons(place) for place in range(len(found.image_names))]
         assert not any(Reason.UNPROVEN in held for held in reasons)
         num_forced = sum(Reason.FORCED in held for held in reasons)
