@@ -24,7 +24,7 @@ class ImageNames(Sequence[str]):
 
     def take(self, rows: NDArray[np.integer]) -> tuple[str, ...]:
         """The names of some rows."""
-        return tuple(name.decode() for name in self.encoded[rows].tolist())
+        return tuple(ImageNames(self.encoded[rows]))
 
     def rows_of(self, names: Sequence[str]) -> NDArray[np.int64]:
         """(n,) row of each name; -1 where there is no such image."""
@@ -48,7 +48,7 @@ class ImageNames(Sequence[str]):
         return str(self.encoded[row].decode())
 
     def __iter__(self) -> Iterator[str]:
-        return (name.decode() for name in self.encoded.tolist())
+        return iter(b"\0".join(self.encoded.tolist()).decode().split("\0") if len(self) else ())
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Sequence) and tuple(self) == tuple(other)

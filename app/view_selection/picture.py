@@ -30,7 +30,6 @@ from app.view_selection.describe import percent
 from app.view_selection.explanation import Reason
 from app.view_selection.problem import ViewProblem
 from app.view_selection.selection import Selection
-from app.workspace import atomic_file
 
 _PANEL_PX, _GAP_PX, _HEAD_PX, _LINE_PX = 560, 12, 92, 22
 _MARGIN = 0.04
@@ -46,9 +45,9 @@ def write_picture(
     folder: Path, problem: ViewProblem, cluster: Cluster, selection: Selection, labels: MapLabels
 ) -> None:
     """Write :func:`draw_selection` to ``CLUSTER.png`` in a folder, which is made."""
+    folder.mkdir(parents=True, exist_ok=True)
     picture = encode_png(draw_selection(problem, cluster, selection, labels))
-    with atomic_file(folder / f"{cluster.name}.png") as path:
-        path.write_bytes(picture)
+    (folder / f"{cluster.name}.png").write_bytes(picture)
 
 
 def draw_selection(problem: ViewProblem, cluster: Cluster, selection: Selection, labels: MapLabels) -> Image:

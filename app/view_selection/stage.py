@@ -149,10 +149,7 @@ def _select_in_worker(batch: range) -> list[Selection]:
 
 
 def _solved(selector: _Selector, num_workers: int) -> Iterator[Selection]:
-    """Selections in the order of the clusters, with few of them in memory.
-
-    This process does what no worker has begun: they need a while to start.
-    """
+    """Selections in the order of the clusters, with few of them in memory."""
     total = len(selector.clusters)
     batches = iter([range(first, min(first + _BATCH, total)) for first in range(0, total, _BATCH)])
     if num_workers == 1:
@@ -165,11 +162,10 @@ def _solved(selector: _Selector, num_workers: int) -> Iterator[Selection]:
         initializer=_start_worker,
         initargs=(os.getpid(), *selector.arguments),
     ) as executor:
-        running = deque[tuple[range, Future[list[Selection]]]]()
+        running = deque[Future[list[Selection]]]()
         while True:
             for batch in islice(batches, 3 * num_workers - len(running)):
-                running.append((batch, executor.submit(_select_in_worker, batch)))
+                running.append(executor.submit(_select_in_worker, batch))
             if not running:
                 return
-            batch, future = running.popleft()
-            yield from selector.select(batch) if future.cancel() else future.result()
+            yield from running.popleft().result()
