@@ -19,6 +19,8 @@ from mvs_backends.base import MvsError
 
 _POLL_S = 0.2
 _NUM_LAST_LINES = 3
+_TRACE = ("@ ", "*** ", "PC: @")
+"""How the lines of glog's stack traces begin, which come after the reason."""
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
 
@@ -108,5 +110,6 @@ def _die_with_parent() -> None:
 
 def _last_lines(log_file: Path) -> str:
     with log_file.open(encoding="utf-8", errors="replace") as log:
-        lines = deque((line.strip() for line in log if line.strip()), maxlen=_NUM_LAST_LINES)
+        stripped = (line.strip() for line in log)
+        lines = deque((line for line in stripped if line and not line.startswith(_TRACE)), maxlen=_NUM_LAST_LINES)
     return f"its last lines: {' | '.join(lines)} (all in {log_file})"

@@ -112,7 +112,7 @@ def trial_job(folder: Path) -> tuple[MvsJob, float]:
         )
         image = pycolmap.Image(name=f"{index}.png", camera_id=1, image_id=index + 1)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
-        pixels = texture[:, index * step_px : index * step_px + width]
+        pixels = texture[:, index * step_px : index * step_px + width].round().astype(np.uint8)
         cv2.imwrite(str(folder / "images" / f"{index}.png"), pixels)
     model.write_binary(folder / "sparse")
     none = np.zeros(0, np.int64)
