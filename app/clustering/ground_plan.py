@@ -227,7 +227,7 @@ def blank(width_px: int, height_px: int) -> Image:
 def legend(
     image: Image, at_px: tuple[int, int], entries: Sequence[tuple[str, Color, str]], text_scale: float = 0.42
 ) -> None:
-    """A line that explains symbols, from its lower left corner.
+    """A line that explains symbols, from its lower left corner; what has no room is cut off.
 
     Args:
         image: To draw on.
@@ -254,9 +254,10 @@ def legend(
         else:
             swatch.dots((left + right) / 2, 2.6, color)
         top = y - round(9 * text_scale) - height // 2
-        image[top : top + height, x : x + width] = swatch.image
+        room = image[top : top + height, x : x + width]
+        room[:] = swatch.image[:, : room.shape[1]]
         write(image, text, (x + width + 6, y), text_scale)
-        x += width + 28 + text_width(text, text_scale)
+        x += width + 22 + text_width(text, text_scale)
 
 
 def write(image: Image, text: str, at_px: tuple[int, int], scale: float, color: Color = INK) -> None:

@@ -150,9 +150,9 @@ def legend_of_panels(width: int, *, shows_solid: bool = False, text_scale: float
         ("dot", BLUE, "keypoint"),
         ("ray", RED, "view (after: needed by a point or a match)"),
         ("ray", NOT_NEEDED, "other selected view"),
-        ("dot", LIGHT_GREY, "view that is not selected"),
+        ("dot", LIGHT_GREY, "view not selected"),
     ]
     if shows_solid:
-        entries.append(("box", SOLID, "solid, higher than the views"))
+        entries.append(("box", SOLID, "solid above views"))
     legend(bar, (_GAP_PX, _LINE_PX), entries, text_scale)
     return bar

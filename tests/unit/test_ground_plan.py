@@ -113,7 +113,7 @@ def test_the_scale_bar_has_the_length_that_it_names() -> None:
 
 
 def test_a_png_holds_the_image_and_names_in_any_script_can_be_written() -> None:
-    plan = _plan((700, 200))
+    plan = _plan((400, 200))
     plan.label("Straße 東京.jpg", (10, 100), 0.5)
     legend(plan.image, (4, 40), tuple((kind, RED, kind) for kind in ("dot", "ray", "box", "line", "dash", "cross")))
     assert (plan.image[20:50] != np.array(WHITE)).any()
