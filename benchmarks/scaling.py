@@ -2,8 +2,7 @@
 
 python -m benchmarks.scaling OUTPUT.json MODEL... [--workers 2] [--method optimal]
 
-Kernels are compiled before, by a run on the first model that is not counted. Peak memory is an upper bound: the peak
-of the process plus, for each worker, that of the largest.
+Kernels are compiled before, by a run on the first model that is not counted.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ def main() -> None:
     arguments = parser.parse_args()
     print(describe_machine())
     print(f"selection {arguments.method} in {arguments.workers} processes")
-    print("| images | clusters | cluster, CPU-s (wall) | select, CPU-s (wall) | CPU-ms per image | peak GiB, at most |")
+    print("| images | clusters | cluster, CPU-s (wall) | select, CPU-s (wall) | CPU-ms per image | peak GiB |")
     print("|---|---|---|---|---|---|")
     rows = []
     for number, model in enumerate([arguments.models[0], *arguments.models]):
@@ -44,10 +43,9 @@ def main() -> None:
         rows.append({"model": model.name, "num_images": num_images, **asdict(run)})
         arguments.output.write_text(json.dumps(rows, indent=1) + "\n")
         costs = " | ".join(f"{cost.cpu_s:.1f} ({cost.wall_s:.1f})" for cost in (run.clustering, run.selection))
-        peak_gib = run.process_gib + (arguments.workers - 1) * run.worker_gib
         print(
             f"| {num_images:,} | {report['num_clusters']:,} | {costs} "
-            f"| {1000 * run.cpu_s / num_images:.2f} | {peak_gib:.2f} |",
+            f"| {1000 * run.cpu_s / num_images:.2f} | {run.peak_gib:.2f} |",
             flush=True,
         )
 

@@ -31,10 +31,9 @@ class StageRun:
 
     clustering: Cost
     selection: Cost
-    process_gib: float
-    """Peak resident memory of the process."""
-    worker_gib: float
-    """Peak resident memory of the largest worker."""
+    peak_gib: float
+    """Peak resident memory of the process and its workers together, mapped files included, shared pages counted once.
+    Read from the system every second, as the peaks that it keeps count shared pages in each process."""
 
     @property
     def cpu_s(self) -> float:
@@ -57,10 +56,28 @@ def run_stages(model_dir: Path, output_dir: Path, method: SelectionMethod, num_w
         num_workers: Of selection.
     """
     command = [sys.executable, "-m", __name__, str(model_dir), str(output_dir), method, str(num_workers)]
-    finished = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-    record = json.loads(finished.stdout)
-    record["clustering"], record["selection"] = Cost(**record["clustering"]), Cost(**record["selection"])
-    return StageRun(**record)
+    peak_gib = 0.0
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        while process.poll() is None:
+            peak_gib = max(peak_gib, _resident_gib(process.pid))
+            time.sleep(1.0)
+        output = process.stdout.read() if process.stdout else ""
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, command)
+    record = json.loads(output)
+    return StageRun(clustering=Cost(**record["clustering"]), selection=Cost(**record["selection"]), peak_gib=peak_gib)
+
+
+def _resident_gib(pid: int) -> float:
+    """Proportional set size of a process and all its descendants; 0 for those that have just ended."""
+    folder = Path("/proc") / str(pid)
+    try:
+        lines = (folder / "smaps_rollup").read_text().splitlines()
+        children = (folder / "task" / str(pid) / "children").read_text().split()
+    except OSError:
+        return 0.0
+    own_kib = next((int(line.split()[1]) for line in lines if line.startswith("Pss:")), 0)
+    return own_kib / 2**20 + sum(_resident_gib(int(child)) for child in children)
 
 
 def _main(model_dir: str, output_dir: str, method: str, num_workers: str) -> None:
@@ -74,14 +91,11 @@ def _main(model_dir: str, output_dir: str, method: str, num_workers: str) -> Non
     selection = SelectionOptions(method=SelectionMethod(method), visibility=Visibility.FRUSTUM)
     select(folder / "clusters", folder / "selection", options=selection, num_workers=int(num_workers))
     selected = _now()
-    usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    run = StageRun(
-        clustering=Cost(wall_s=clustered[0] - started[0], cpu_s=clustered[1] - started[1]),
-        selection=Cost(wall_s=selected[0] - clustered[0], cpu_s=selected[1] - clustered[1]),
-        process_gib=usage[0].ru_maxrss / 2**20,
-        worker_gib=usage[1].ru_maxrss / 2**20,
-    )
-    print(json.dumps(asdict(run)))
+    costs = {
+        "clustering": Cost(wall_s=clustered[0] - started[0], cpu_s=clustered[1] - started[1]),
+        "selection": Cost(wall_s=selected[0] - clustered[0], cpu_s=selected[1] - clustered[1]),
+    }
+    print(json.dumps({name: asdict(cost) for name, cost in costs.items()}))
 
 
 def _now() -> tuple[float, float]:
