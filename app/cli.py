@@ -37,7 +37,9 @@ ImagesArgument = Annotated[
 GpsOption = Annotated[
     Path | None,
     typer.Option(
-        "--gps", metavar="FILE", help="CSV with name or frame, lat, lon, alt; or TUM/KITTI poses as positions."
+        "--gps",
+        metavar="FILE",
+        help="CSV with name or frame, lat, lon, alt; GPX (for videos); or TUM/KITTI poses as positions.",
     ),
 ]
 RigOption = Annotated[

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from app.capture.gpx import read_gpx
 from app.capture.inventory import FrameEntry
 from app.capture.matching import FrameIndex
 from app.capture.tables import Table, read_table
@@ -40,15 +41,18 @@ class GpsTable:
 
 
 def read_gps_file(path: Path) -> GpsTable:
-    """Read a GPS table.
+    """Read a GPS table, or a GPX track (`.gpx`), whose first point is where the videos start.
 
-    The header names the columns: one of `name image filename frame index` (or, for videos, `time_s time timestamp
+    A table's header names the columns: one of `name image filename frame index` (or, for videos, `time_s time timestamp
     seconds`), then `lat`, `lon` and optionally `alt`, in any order and with the usual longer names. Other columns
     don't matter.
 
     Raises:
         InputError: the file, a column or a row can't be used.
     """
+    if path.suffix.lower() == ".gpx":
+        track = np.array(read_gpx(path))
+        return GpsTable(path=path, keys=(), times_s=track[:, 0], positions=track[:, 1:])
     table = read_table(path)
     key, time = table.column(_KEY_COLUMNS), table.column(_TIME_COLUMNS)
     lat, lon, height = (table.column(names) for names in (_LAT_COLUMNS, _LON_COLUMNS, _HEIGHT_COLUMNS))
@@ -145,7 +149,8 @@ def _assign_by_time(
     timed = [(frame.name, frame.time_s) for frame in frames if frame.time_s is not None]
     if not timed:
         raise InputError(
-            f"{table.path} gives positions by time, and only frames of videos have times; give frame names"
+            f"{table.path} gives positions by time, and only frames of videos have times; give frame names, or write "
+            "the track into the images first (exiftool -geotag TRACK.gpx IMAGES)"
         )
     inside = [(name, time) for name, time in timed if times_s[0] <= time <= times_s[-1]]
     if not inside:

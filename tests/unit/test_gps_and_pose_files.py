@@ -69,6 +69,48 @@ def test_gps_by_time_is_for_videos_only(tmp_path: Path) -> None:
     assert found["2"] == pytest.approx((2.0, -179.5, 4.0))
 
 
+GPX = """<?xml version="1.0"?>
+<gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>
+ <trkpt lat="1.0" lon="20.0"><ele>5.5</ele><time>2024-05-01T10:00:00Z</time></trkpt>
+ <trkpt lat="9.0" lon="29.0"><time>2024-05-01T10:00:00Z</time></trkpt>
+ <trkpt lat="9.0" lon="29.0"/>
+</trkseg><trkseg>
+ <trkpt lat="2.0" lon="21.0"><ele>7.5</ele><time>2024-05-01T12:00:02.500+02:00</time></trkpt>
+</trkseg></trk></gpx>
+"""
+
+
+def test_a_gpx_track_starts_with_the_video(tmp_path: Path) -> None:
+    path = tmp_path / "ride.GPX"
+    path.write_text(GPX)
+    frames = [FrameEntry(name=str(i), images={"": f"{i}.jpg"}, time_s=float(i)) for i in range(4)]
+    found = assign_gps(frames, read_gps_file(path))
+    assert found == {
+        "0": (1.0, 20.0, 5.5),
+        "1": pytest.approx((1.4, 20.4, 6.3)),
+        "2": pytest.approx((1.8, 20.8, 7.1)),
+    }
+    with pytest.raises(InputError, match="exiftool"):
+        assign_gps(RIG, read_gps_file(path))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("</gpx>", "", "is not a GPX file"),
+        ("trkpt", "wpt", "has 0 track points with times"),
+        ('lat="2.0"', 'lat="92.0"', r"track point 4: \(92, 21\) is no place"),
+        ('lat="2.0"', "", "track point 4: could not convert"),
+        ("12:00:02", "25:00:02", "track point 4: hour"),
+    ],
+)
+def test_gpx_that_cannot_be_used(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = tmp_path / "ride.gpx"
+    path.write_text(GPX.replace(old, new))
+    with pytest.raises(InputError, match=message):
+        read_gps_file(path)
+
+
 def test_a_number_means_one_image_of_each_camera_that_is_no_rig(tmp_path: Path) -> None:
     frames = [FrameEntry(name=f"{c}/{n}.jpg", images={c: f"{c}/{n}.jpg"}) for c in "ab" for n in ("01", "02")]
     expected = {f"{c}/02.jpg": (1.0, 2.0, 3.0) for c in "ab"}
