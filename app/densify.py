@@ -20,6 +20,7 @@ from app.versions import program_version
 from fusion.cloud import write_ply
 from fusion.depth_fusion import FusionOptions, fuse_depth_maps
 from fusion.merge import crop_cloud
+from fusion.thinning import thin
 from mvs_backends import get_backend
 from mvs_backends.base import MvsOptions
 
@@ -81,6 +82,8 @@ def fuse_job(job_folder: Path, dense: Path, output: Path, options: FusionOptions
         for leftover in partial.glob("uncropped.ply*"):
             leftover.unlink()
         cloud = crop_cloud(cloud, region)
+        if options.voxel_m:
+            cloud = thin(cloud, options.voxel_m)
         if len(cloud):
             write_ply(partial / "cloud.ply", cloud)
 

@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from fusion.cloud import PointCloud
@@ -127,6 +126,9 @@ def mesh_distances(query: NDArray[np.float32], mesh: Path) -> NDArray[np.float32
         FusionError: Open3D can't be loaded.
         OSError: The file can't be read.
     """
+    # Here, since it takes as long to load as all else that every command loads.
+    import trimesh
+
     with mesh.open("rb"):
         pass
     o3d = import_open3d()

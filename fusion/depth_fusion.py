@@ -27,6 +27,9 @@ class FusionOptions:
     """Largest relative difference of depths."""
     max_normal_error_deg: float = 15.0
     """Largest angle between normals."""
+    voxel_m: float = 0.0
+    """Keep one point in each voxel of this size, the one nearest its centre: fewer points, and a density that depends
+    less on which views a cluster has. 0: keep all."""
 
     def __post_init__(self) -> None:
         if self.min_num_pixels < 1:
@@ -34,6 +37,8 @@ class FusionOptions:
         for name in ("max_reproj_error_px", "max_depth_error", "max_normal_error_deg"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be greater than 0, not {getattr(self, name)}")
+        if not 0 <= self.voxel_m < float("inf"):
+            raise ValueError(f"voxel_m must be at least 0, not {self.voxel_m}")
 
 
 def fuse_depth_maps(

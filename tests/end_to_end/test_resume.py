@@ -10,12 +10,14 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from app.config import read_config
 from app.densify import densify_inputs
 from app.stage import is_current
 from app.workspace import Workspace
+from fusion.cloud import read_ply
 from mvs_backends import choose_backend
 from tests.small_street import OPTIONS, FinishedRun, cityrecon, error_lines, kill_when, refused
 
@@ -153,6 +155,12 @@ def test_a_fusion_option_redoes_fusion_only(finished_run: FinishedRun, tmp_path:
     assert {stage: records(workspace, stage) for stage in before} == before
     assert all(made > fused[name] for name, made in records(workspace, "fused").items())
     assert out.stat().st_size < finished_run.out.stat().st_size
+    coarse = tmp_path / "coarse.ply"
+    result = cityrecon("fuse", workspace, "--out", coarse, "--min-num-pixels", "4", "--voxel-m", "0.1")
+    assert result.returncode == 0, result.stderr
+    whole, thinned = (np.unique(np.floor(read_ply(path).points / 0.1), axis=0) for path in (out, coarse))
+    np.testing.assert_array_equal(thinned, whole)
+    assert len(read_ply(coarse)) < 1.02 * len(thinned), "one point per voxel, and per cluster at the borders of cells"
 
 
 def test_a_selection_option_redoes_the_clusters_whose_views_changed(finished_run: FinishedRun, tmp_path: Path) -> None:
