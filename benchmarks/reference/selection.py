@@ -24,6 +24,8 @@ class PlainProgram:
 
     images: tuple[int, ...]
     """Rows of the scene, one a view."""
+    keypoints: tuple[int, ...]
+    """Rows of the scene; the first of the points. In the order of their positions."""
     visible: NDArray[np.bool_]
     """(N_c, P_c) the matrix B."""
     matches: NDArray[np.bool_]
@@ -40,7 +42,11 @@ def plain_program(
 ) -> PlainProgram:
     """Project every point of a cluster into every image of it, and count what each pair has in common."""
     images = tuple(sorted(cluster.images))
-    points = _points(scene, cluster, clustering)
+    bounds = [padded_bounds(cell, clustering) for cell in cluster.cells]
+    found = np.flatnonzero(np.any([inside(scene, low, high) for low, high in bounds], axis=0))
+    keypoints = tuple(sorted(found.tolist(), key=lambda row: tuple(scene.points_in_world[row])))
+    block_samples = [samples(low, high, cluster.z_range, clustering) for low, high in bounds]
+    points = np.concatenate([scene.points_in_world[list(keypoints)], *block_samples])
     visible = np.array([sees(scene, image, points) for image in images])
     shared = visible.astype(np.float32) @ visible.astype(np.float32).T
     matches = shared >= options.min_shared_points
@@ -49,6 +55,7 @@ def plain_program(
     wanted = min(max(math.ceil(options.min_views_fraction * len(images)), options.n_low), options.n_high)
     return PlainProgram(
         images=images,
+        keypoints=keypoints,
         visible=visible,
         matches=matches,
         usable=usable,
@@ -68,6 +75,47 @@ def solve(program: PlainProgram, *, force_best_views: bool) -> frozenset[int]:
     Raises:
         RuntimeError: SCIP didn't prove that the set is the smallest.
     """
+    solver, x = _model(program)
+    if force_best_views:
+        # A stable sort: of views that see equally much, the first by name.
+        best_first = sorted(np.flatnonzero(program.usable), key=lambda view: -int(program.visible[view].sum()))
+        for view in best_first[: program.n_min]:
+            x[view].SetLb(1)
+    solver.Minimize(solver.Sum(x))
+    _solve(solver)
+    return frozenset(
+        image for image, variable in zip(program.images, x, strict=True) if variable.solution_value() > 0.5
+    )
+
+
+def best_quality(program: PlainProgram, quality: NDArray[np.float64], viewpoint: NDArray[np.int64], size: int) -> float:
+    """The best total quality of a selection of a size: the sum over viewpoints of its best view there.
+
+    Beyond [O]: what the program's `optimal` selection asks for.
+
+    Args:
+        program: All of it goes to the solver.
+        quality: (N_c,) from :func:`benchmarks.reference.quality.plain_quality`.
+        viewpoint: (N_c,) likewise.
+        size: Number of views.
+
+    Raises:
+        RuntimeError: SCIP didn't prove that it is the best.
+    """
+    solver, x = _model(program)
+    solver.Add(solver.Sum(x) == size)
+    counts = [solver.NumVar(0, 1, f"counts{view}") for view in range(len(x))]
+    for view, counting in enumerate(counts):
+        solver.Add(counting <= x[view])
+    for number in np.unique(viewpoint):
+        solver.Add(solver.Sum([counts[view] for view in np.flatnonzero(viewpoint == number)]) <= 1)
+    solver.Maximize(solver.Sum([float(value) * counting for value, counting in zip(quality, counts, strict=True)]))
+    _solve(solver)
+    return float(solver.Objective().Value())
+
+
+def _model(program: PlainProgram) -> tuple[pywraplp.Solver, list[pywraplp.Variable]]:
+    """The constraints of [O], one per view and one per point."""
     solver = pywraplp.Solver.CreateSolver("SCIP")
     x = [solver.IntVar(0, int(can), f"x{view}") for view, can in enumerate(program.usable)]
     enough = solver.Constraint(program.n_min, solver.infinity())
@@ -83,18 +131,12 @@ def solve(program: PlainProgram, *, force_best_views: bool) -> frozenset[int]:
         covered = solver.Constraint(min(program.n_vis, len(views)), solver.infinity())
         for view in views:
             covered.SetCoefficient(x[view], 1)
-    if force_best_views:
-        # A stable sort: of views that see equally much, the first by name.
-        best_first = sorted(np.flatnonzero(program.usable), key=lambda view: -int(program.visible[view].sum()))
-        for view in best_first[: program.n_min]:
-            x[view].SetLb(1)
-    for variable in x:
-        solver.Objective().SetCoefficient(variable, 1)
+    return solver, x
+
+
+def _solve(solver: pywraplp.Solver) -> None:
     if solver.Solve() != pywraplp.Solver.OPTIMAL:
         raise RuntimeError("SCIP found no proven optimum")
-    return frozenset(
-        image for image, variable in zip(program.images, x, strict=True) if variable.solution_value() > 0.5
-    )
 
 
 def meets_all(program: PlainProgram, images: frozenset[int]) -> bool:
@@ -106,15 +148,6 @@ def meets_all(program: PlainProgram, images: frozenset[int]) -> bool:
         and not np.any(x[~program.usable])
         and np.all(program.matches @ x - program.n_match * x >= 0)
         and np.all(program.visible.T.astype(np.int64) @ x >= np.minimum(program.n_vis, seen_by))
-    )
-
-
-def _points(scene: PosedScene, cluster: PlainCluster, options: ClusteringOptions) -> NDArray[np.float64]:
-    """(P_c, 3) keypoints, each once, and the samples of every cell."""
-    bounds = [padded_bounds(cell, options) for cell in cluster.cells]
-    keypoints = np.any([inside(scene, low, high) for low, high in bounds], axis=0)
-    return np.concatenate(
-        [scene.points_in_world[keypoints], *(samples(low, high, cluster.z_range, options) for low, high in bounds)]
     )
 
 

@@ -16,7 +16,8 @@ from app.view_selection.selection import select_views
 from benchmarks.drives.presets import PRESETS
 from benchmarks.drives.write_drive import write_drive
 from benchmarks.reference.clustering import plain_clusters
-from benchmarks.reference.selection import meets_all, plain_program, solve
+from benchmarks.reference.quality import plain_quality
+from benchmarks.reference.selection import best_quality, meets_all, plain_program, solve
 
 
 def test_the_reference_agrees_with_the_program(tmp_path: Path) -> None:
@@ -38,7 +39,7 @@ def test_the_reference_agrees_with_the_program(tmp_path: Path) -> None:
     assert max(len(cluster.cells) for cluster in plain) > 1
 
     cutter, clusters = ProblemCutter(scene), name_clusters(scene, blocks, options).clusters
-    for number in range(0, len(plain), 2):
+    for number in range(0, len(plain), 3):
         for method in SelectionMethod:
             selection = SelectionOptions(method=method, n_low=4, n_high=8, n_vis=3, min_shared_points=60)
             program = plain_program(scene, plain[number], options, selection)
@@ -47,3 +48,7 @@ def test_the_reference_agrees_with_the_program(tmp_path: Path) -> None:
             smallest = solve(program, force_best_views=method is SelectionMethod.PAPER)
             assert meets_all(program, rows) and meets_all(program, smallest)
             assert len(rows) == len(smallest)
+            if method is SelectionMethod.OPTIMAL and rows:
+                quality, viewpoint = plain_quality(scene, program)
+                best = best_quality(program, quality, viewpoint, len(rows))
+                assert found.quality == pytest.approx(best, rel=1e-6)
