@@ -31,11 +31,14 @@ from app.clustering.ground_plan import (
 )
 from app.scene.posed_scene import PosedScene
 
-_PANEL_PX, _MIN_HEIGHT_PX, _GAP_PX, _HEAD_PX, _FOOT_PX = 760, 480, 14, 46, 46
+_CELL_PX, _PANELS_PX, _MIN_HEIGHT_PX = 8, (760, 1600), 480
+"""A panel is as wide as its cells need, within limits."""
+_GAP_PX, _HEAD_PX, _FOOT_PX = 14, 46, 46
 _TEXT_SCALE = 0.6
 _MARGIN = 0.03
-_DETAIL_CELLS = 3.6
-_MIN_CELL_PX = 3.0
+_DETAIL_CELL_PX = 211
+_MIN_CELL_PX = 4.0
+"""Borders of smaller cells would fill the picture."""
 _GLASS = 0.55
 _NAME_PX = (125, 56)
 _COMPRESSION = 9
@@ -76,37 +79,27 @@ def write_map(scene: PosedScene, clustering: Clustering, path: Path, labels: Map
     """
     areas = [_Area(c.name, c.cells, len(c.image_names), c.is_small) for c in clustering.clusters]
     colors = [_FILLS[number] for number in color_numbers([area.cells for area in areas])]
-    grid = clustering.grid
+    grid, unit = clustering.grid, labels.unit
     size = np.array(grid.block_size_m)
-    cells = np.array([cell for area in areas for cell in area.cells] + [block.cell for block in clustering.dropped])
-    low, high = cells.min(axis=0), cells.max(axis=0) + 1
-    margin = _MARGIN * (high - low) * size
-    height = int(np.clip(_PANEL_PX * np.divide(*((high - low) * size)[::-1]), _MIN_HEIGHT_PX, _PANEL_PX))
-    corners = low * size + grid.origin_m - margin, high * size + grid.origin_m + margin
-    raw = GroundPlan(*corners, (_PANEL_PX, height), SCALE_BAR_PX)
-    whole = raw.copy()
     dropped = np.array([block.cell for block in clustering.dropped], dtype=np.int64).reshape(-1, 2)
+    cells = np.concatenate([dropped, *(np.array(area.cells) for area in areas)])
+    low, high = cells.min(axis=0), cells.max(axis=0) + 1
+    width = int(np.clip(_CELL_PX * (high - low).max(), *_PANELS_PX))
+    height = int(np.clip(width * np.divide(*((high - low) * size)[::-1]), _MIN_HEIGHT_PX, width))
+    margin = _MARGIN * (high - low) * size
+    corners = low * size + grid.origin_m - margin, high * size + grid.origin_m + margin
+    raw = GroundPlan(*corners, (width, height), SCALE_BAR_PX)
+    whole = raw.copy()
     raw.boxes(_corners(dropped, grid), _DROPPED)
     _draw_grid(raw, grid, low, high)
     raw.haze(scene.points_in_world, BLUE, 0.4)
-
-    for area, color in zip(areas, colors, strict=True):
-        whole.boxes(_corners(area.cells, grid), _lighter(color))
-        whole.lines(_sides(area.cells, grid), _darker(color))
-    whole.haze(scene.points_in_world, BLUE, 0.25)
-    whole.dots(scene.centers_in_world, 1.4, RED)
-    for area in areas:
-        if area.is_small:
-            _cross(whole, area, grid)
-
+    _draw_clusters(whole, scene, areas, colors, grid)
     middle = _middle_of_detail(areas, grid)
-    half = _DETAIL_CELLS / 2 * size.max() * np.array([_PANEL_PX / height, 1.0])
-    detail = GroundPlan(middle - half, middle + half, (_PANEL_PX, height))
+    half = np.array([width, height]) / (2 * _DETAIL_CELL_PX) * size.max()
+    detail = GroundPlan(middle - half, middle + half, (width, height))
     _draw_detail(detail, scene, areas, colors, grid)
     frame = middle + half * [[-1, -1], [1, -1], [1, 1], [-1, 1]]
     whole.lines(np.stack([frame, np.roll(frame, -1, axis=0)], axis=1), INK, 2)
-
-    unit = labels.unit
     columns = (
         (raw, f"Grid of {size[0]:g} x {size[1]:g} {unit}: {len(cells):,} blocks with keypoints"),
         (whole, f"{len(areas):,} clusters of {len(scene.image_names):,} views"),
@@ -122,7 +115,7 @@ def _composed(columns: Sequence[tuple[GroundPlan, str]], labels: MapLabels) -> I
     for plan, title in columns:
         plan.scale_bar(labels, _TEXT_SCALE)
         plan.frame()
-        head = blank(_PANEL_PX, _HEAD_PX)
+        head = blank(plan.image.shape[1], _HEAD_PX)
         write(head, title, (0, 30), 0.75)
         parts += [np.concatenate([head, plan.image]), gap]
     body = np.concatenate(parts, axis=1)
@@ -147,6 +140,21 @@ def _draw_grid(plan: GroundPlan, grid: GroundGrid, low: NDArray[np.int64], high:
     ends = [((i, low[1]), (i, high[1])) for i in range(low[0], high[0] + 1)]
     ends += [((low[0], j), (high[0], j)) for j in range(low[1], high[1] + 1)]
     plan.lines(np.array(ends) * size + grid.origin_m, LIGHT_GREY)
+
+
+def _draw_clusters(
+    plan: GroundPlan, scene: PosedScene, areas: Sequence[_Area], colors: Sequence[Color], grid: GroundGrid
+) -> None:
+    """Each cluster in its colour, with a cross if it is small, the keypoints and the views."""
+    for area, color in zip(areas, colors, strict=True):
+        plan.boxes(_corners(area.cells, grid), _lighter(color))
+        if min(grid.block_size_m) * plan.px_per_unit >= _MIN_CELL_PX:
+            plan.lines(_sides(area.cells, grid), _darker(color))
+    plan.haze(scene.points_in_world, BLUE, 0.25)
+    plan.dots(scene.centers_in_world, 1.4, RED)
+    for area in areas:
+        if area.is_small:
+            _cross(plan, area, grid)
 
 
 def _draw_detail(
