@@ -22,13 +22,15 @@ from tests.reference.two_streets import OTHER_STREET, STREET, cameras, facade
 BOUNDS_M = np.array([[0.0, 0.0], [30.0, 24.0]])
 
 
-def observed(walls: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points, and rays from each camera to all points of its wall within 15 m."""
+def observed(
+    walls: list[tuple[np.ndarray, np.ndarray]], radius_m: float = 15.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, and rays from each camera to all points of its wall within the radius."""
     points = np.concatenate([wall for wall, _ in walls])
     rows, centers, first = [], [], 0
     for wall, views in walls:
         for view in views:
-            near = np.flatnonzero(np.linalg.norm(wall - view, axis=1) < 15)
+            near = np.flatnonzero(np.linalg.norm(wall - view, axis=1) < radius_m)
             rows.append(first + near)
             centers.append(np.tile(view, (len(near), 1)))
         first += len(wall)
@@ -58,6 +60,10 @@ def test_the_open_street_and_its_facade_are_seen(houses: SolidColumns) -> None:
         assert is_seen(houses, [2.0, STREET, 1.7], point)
 
 
+def test_a_keypoint_a_little_behind_its_facade_is_seen(houses: SolidColumns) -> None:
+    assert is_seen(houses, [10.0, STREET, 1.7], [11.0, 8.9, 3.0])
+
+
 def test_nothing_inside_a_house_is_seen(houses: SolidColumns) -> None:
     for y, camera_y in ((11.0, STREET), (12.0, STREET), (12.0, OTHER_STREET)):
         assert not is_seen(houses, [14.0, camera_y, 1.7], [15.0, y, 3.0])
@@ -74,6 +80,21 @@ def test_a_plain_wall_closes_between_its_windows() -> None:
     solid = solid_columns(*observed([(wall, cameras(STREET))]), bounds_m=BOUNDS_M, column_m=1.0)
     hidden = [not is_seen(solid, [x, STREET, 1.7], [x, 15.0, 2.0]) for x in np.arange(3.0, 27.0, 0.5)]
     assert all(hidden)
+
+
+def test_points_with_an_error_open_nothing_behind_their_wall() -> None:
+    """The wall is at y = 7.9, its points up to 0.3 m behind it, many of them in the next column."""
+    wall = facade(7.9)
+    wall[:, 1] += np.random.default_rng(1).uniform(0, 0.3, len(wall))
+    from_the_front = observed([(wall, cameras(STREET))], radius_m=4.8)
+    solid = solid_columns(*from_the_front, bounds_m=BOUNDS_M, column_m=1.0)
+    assert solid.hold(np.array([[x, 8.5, 1.0] for x in np.arange(3.5, 27.0)])).all()
+
+
+def test_a_road_without_keypoints_is_free_below_the_rays() -> None:
+    wall = facade(8.0)
+    solid = solid_columns(*observed([(wall[wall[:, 2] > 2], cameras(STREET))]), bounds_m=BOUNDS_M, column_m=1.0)
+    assert is_seen(solid, [2.0, STREET, 1.7], [20.0, 7.5, 1.0])
 
 
 def test_a_gap_between_houses_that_is_looked_through_is_open() -> None:
