@@ -20,6 +20,9 @@ Interest Points, Delaunay Triangulation and Graph Cuts, 2007, section 3; Hornung
 Height fields of streets: Gallup, Frahm & Pollefeys, A Heightmap Model for Efficient 3D Reconstruction from Street-Level
 Video, 2010. They weigh hits against misses; here a single ray frees a column, because a view that is kept in vain costs
 time, but one that is lost costs surface.
+
+On rendered towns (docs/benchmarks.md) 97 to 99 % of the samples that a camera truly sees are kept where walls have
+texture, 95 to 98 % where three quarters of them have none, while the share of true pairs among them more than doubles.
 """
 
 from __future__ import annotations
@@ -35,12 +38,14 @@ from app.scene.posed_scene import PosedScene, projection_centers
 RAY_GAP = 0.5
 """In columns: how far before its point a ray ends, because the point's depth is uncertain."""
 CLEARANCE = 1.5
-"""In columns: how far below its lowest ray a column is still free. Rays end at keypoints, and roads have few."""
+"""In columns: how far below its lowest ray a column is still free. Rays end at keypoints, and roads have few: in a town
+with poor texture, 37 % of the ground that cameras see within 20 m was lost with 0.5, and 4 % of all low spots with 1.5."""
 REACH = 2
 """In columns: how far around a point columns may be as high as it is."""
 MAX_SOLID = 1.5
 """In columns: what a line of sight may pass of solid, on the ground. A column at a wall is partly free, and keypoints
-lie up to their error behind it."""
+lie up to their error behind it. With 1 rather than 1.5, 2 to 4 % more of the pairs are right, but up to 2 % more of
+the true ones are lost."""
 
 
 @dataclass(frozen=True, kw_only=True)
