@@ -112,6 +112,14 @@ def test_the_scale_bar_has_the_length_that_it_names() -> None:
     assert row.sum() == pytest.approx(20 * 5, abs=3)
 
 
+def test_a_label_outside_of_the_image_changes_nothing() -> None:
+    plan = _plan((100, 80))
+    plan.image[:] = 0
+    plan.label("x0001_y0002", (10, -30), 0.5)
+    plan.label("x0001_y0002", (-200, 40), 0.5)
+    assert not plan.image.any()
+
+
 def test_a_png_holds_the_image_and_names_in_any_script_can_be_written() -> None:
     plan = _plan((400, 200))
     plan.label("Straße 東京.jpg", (10, 100), 0.5)
