@@ -38,8 +38,8 @@ from app.scene.posed_scene import PosedScene, projection_centers
 RAY_GAP = 0.5
 """In columns: how far before its point a ray ends, because the point's depth is uncertain."""
 CLEARANCE = 1.5
-"""In columns: how far below its lowest ray a column is still free. Rays end at keypoints, and roads have few: in a town
-with poor texture, 37 % of the ground that cameras see within 20 m was lost with 0.5, with 1.5 it was 4 % of low spots."""
+"""In columns: how far below its lowest ray a column is still free. Rays end at keypoints, and roads have few: in a
+town with poor texture, 0.5 lost 37 % of the ground that cameras see within 20 m, and 1.5 loses 4 % of the low spots."""
 REACH = 2
 """In columns: how far around a point columns may be as high as it is."""
 MAX_SOLID = 1.5

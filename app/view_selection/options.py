@@ -37,7 +37,7 @@ class SelectionOptions:
     visibility: Visibility = Visibility.FRUSTUM
     """`frustum`, `occluded` or `tracks`: which images count as seeing a keypoint. `occluded` also judges samples, and
     leaves out those inside of what is solid and those that fewer than two views see. In rendered towns the selection by
-    `frustum` leaves 3 to 6 % of the surface without two views that see it, that by `occluded` 2 to 3 %, with up to 12 %
+    `frustum` leaves 3 to 6 % of the surface without two views that see it, that by `occluded` 1 to 3 %, with up to 12 %
     more views; it takes 0.2 s more for a cluster of 180 views."""
     n_vis: int = 2
     """Views that must see each point, N_vis; [O] section 4.1."""
