@@ -7,6 +7,13 @@ class CityReconError(Exception):
     exit_code = 1
 
 
+class DiskFullError(CityReconError):
+    """There is no space left. The same command continues once there is."""
+
+    def __init__(self, folder: object) -> None:
+        super().__init__(f"no space left on the disk of {folder}; free some and run the same command again")
+
+
 class InputError(CityReconError):
     """The user's input can't be used. Nothing has been written; the command ends with exit code 2."""
 

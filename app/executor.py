@@ -16,6 +16,7 @@ from typing import Any
 
 from app.errors import CityReconError
 from app.log import log_to_file
+from app.workspace import is_disk_full
 from fusion.errors import FusionError
 from mvs_backends.base import MvsError
 
@@ -97,7 +98,9 @@ def run_jobs(
                 except EOFError:
                     job.process.join()
                     job.pipe.close()
-                    if not job.reported:
+                    if not job.reported and is_disk_full(log_file.parent):
+                        job.reason = f"no space left on the disk of {log_file.parent}"
+                    elif not job.reported:
                         job.reason = f"{_how_it_ended(job.process.exitcode)}; see {log_file}"
                     del running[name]
                     free.append(job.environment)

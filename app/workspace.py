@@ -12,6 +12,9 @@ from pathlib import Path
 
 from app.errors import CityReconError, InputError
 
+_FULL_BYTES = 16 << 20
+"""What a failed write may have been too large for."""
+
 
 @dataclass(frozen=True)
 class Workspace:
@@ -103,6 +106,11 @@ class Workspace:
             yield
         finally:
             os.close(handle)
+
+
+def is_disk_full(folder: Path) -> bool:
+    """Whether there is hardly any space left, which native libraries report in words that don't say so."""
+    return shutil.disk_usage(folder).free < _FULL_BYTES
 
 
 @contextmanager

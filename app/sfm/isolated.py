@@ -14,7 +14,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeVar
 
-from app.errors import CityReconError
+from app.errors import CityReconError, DiskFullError
+from app.workspace import is_disk_full
 
 logger = logging.getLogger(__name__)
 
@@ -37,6 +38,7 @@ def run_isolated(
 
     Raises:
         CityReconError: as raised by the function, or the process ended without a result.
+        DiskFullError: it failed, and there is no space left.
         RuntimeError: the function raised something else; holds its traceback.
     """
     context = multiprocessing.get_context("spawn")
@@ -56,9 +58,13 @@ def run_isolated(
             elif kind == "error":
                 raise value
             elif kind == "traceback":
+                if is_disk_full(log_file.parent):
+                    raise DiskFullError(log_file.parent)
                 raise RuntimeError(value)
     except EOFError:
         process.join()
+        if is_disk_full(log_file.parent):
+            raise DiskFullError(log_file.parent) from None
         raise CityReconError(
             f"{getattr(function, '__name__', 'COLMAP')} ended with {_exit_text(process.exitcode)}: "
             f"{_last_lines(log_file)} (all in {log_file})"

@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 
 from app.capture.inventory import Inventory
-from app.errors import CityReconError, InputError
+from app.errors import CityReconError, DiskFullError, InputError
 from app.sfm.agreement import positions_agree
 from app.sfm.features import extract_features
 from app.sfm.imports import import_model
@@ -220,7 +220,7 @@ def _map(
                     remove_tree(rigged)
                     logger.warning("the images contradict the rig; poses are kept as found without it")
         except (CityReconError, RuntimeError) as error:
-            if isinstance(error, InputError):
+            if isinstance(error, (InputError, DiskFullError)):
                 raise
             logger.warning("sfm: %s failed: %s", strategy, str(error).strip().splitlines()[-1])
             remove_tree(rigged)

@@ -14,7 +14,8 @@ import pytest
 from numpy.typing import NDArray
 
 from app.capture.inventory import CameraEntry, FrameEntry, ImageEntry, Inventory
-from app.errors import InputError
+from app.errors import DiskFullError, InputError
+from app.sfm import stage
 from app.sfm.database import copy_for_mapping
 from app.sfm.mapping import incremental_options, map_incrementally, mend
 from app.sfm.options import SfmOptions, Strategy
@@ -206,6 +207,18 @@ def test_names_with_spaces_and_a_corrupted_database(tmp_path: Path) -> None:
     assert report.registered == 4
     model = pycolmap.Reconstruction(output / "model")
     assert sorted(image.name for image in model.images.values()) == names
+
+
+def test_a_strategy_that_met_a_full_disk_is_tried_again(
+    street: Inventory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*arguments: object, **options: object) -> None:
+        raise DiskFullError(tmp_path)
+
+    monkeypatch.setattr(stage, "run_isolated", fail)
+    with pytest.raises(DiskFullError):
+        stage._map(Strategy.INCREMENTAL, street, tmp_path / "d.db", None, tmp_path, OPTIONS, tmp_path / "log", None)
+    assert not list(tmp_path.glob("*.done"))
 
 
 def test_images_that_share_nothing(tmp_path: Path) -> None:

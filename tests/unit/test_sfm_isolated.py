@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from app.errors import CityReconError, InputError
+from app.errors import CityReconError, DiskFullError, InputError
+from app.sfm import isolated
 from app.sfm.isolated import run_isolated
 
 Progress = Callable[[int, int], None]
@@ -57,3 +58,15 @@ def test_errors_keep_their_kind(tmp_path: Path) -> None:
         run_isolated(refuse, log_file=tmp_path / "log")
     with pytest.raises(RuntimeError, match="ZeroDivisionError"):
         run_isolated(divide, log_file=tmp_path / "log")
+
+
+@pytest.mark.parametrize("function", [divide, abort])
+def test_what_fails_on_a_full_disk_says_so(
+    function: Callable[[Progress], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """SQLite's words for it are `No registered database factory succeeded`."""
+    monkeypatch.setattr(isolated, "is_disk_full", lambda folder: folder == tmp_path)
+    with pytest.raises(DiskFullError, match="no space left on the disk of .*; free some and run"):
+        run_isolated(function, log_file=tmp_path / "log")
+    with pytest.raises(InputError):
+        run_isolated(refuse, log_file=tmp_path / "log")
