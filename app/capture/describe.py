@@ -30,7 +30,7 @@ def describe(inventory: Inventory) -> str:
         lines.append(f"  from videos, every {inventory.video_frame_interval_s:g} s where the vehicle moves")
     turned = sum(image.quarter_turns != 0 for image in inventory.images)
     if turned:
-        lines.append(f"  held upright or upside down by EXIF: {_share(turned, num_images, 'image')}")
+        lines.append(f"  turned by EXIF orientation: {_share(turned, num_images, 'image')}")
     with_gps = sum(frame.gps is not None for frame in inventory.frames)
     with_position = sum(frame.position_m is not None for frame in inventory.frames)
     lines.append(f"  GPS: {_share(with_gps, num_frames, 'frame')}")

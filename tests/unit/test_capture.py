@@ -301,7 +301,7 @@ def test_exif_orientation_agrees_with_opencvs_reader(tmp_path: Path, order: str,
     turns = inventory.images[0].quarter_turns
     stored = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     np.testing.assert_array_equal(np.rot90(stored, -turns), cv2.imread(str(path), cv2.IMREAD_COLOR))
-    assert ("upright or upside down by EXIF: all 2 images" in describe(inventory)) == (orientation != 1)
+    assert ("turned by EXIF orientation: all 2 images" in describe(inventory)) == (orientation != 1)
 
 
 def test_a_gps_file_takes_the_place_of_exif(tmp_path: Path) -> None:
