@@ -101,9 +101,10 @@ def associate(scene: PosedScene, options: ClusteringOptions) -> Blocks:
             with_view[with_view] = _with_a_free_view(
                 scene,
                 points,
+                rows,
                 keypoints=around[inside],
                 samples=grid_points((xs, ys, zs)),
-                centers=centers[rows],
+                centers=centers,
                 image_from_world=image_from_world[rows],
                 sizes_px=sizes_px[rows],
                 column_m=options.sample_spacing_m,
@@ -119,6 +120,7 @@ def associate(scene: PosedScene, options: ClusteringOptions) -> Blocks:
 def _with_a_free_view(
     scene: PosedScene,
     points: PointIndex,
+    image_rows: NDArray[np.integer],
     *,
     keypoints: NDArray[np.float64],
     samples: NDArray[np.float64],
@@ -127,13 +129,16 @@ def _with_a_free_view(
     sizes_px: NDArray[np.float64],
     column_m: float,
 ) -> NDArray[np.bool_]:
-    """(n,) which of n images see a keypoint, or a sample outside of what is solid, that nothing solid hides."""
-    ground = np.concatenate([samples, keypoints, centers])[:, :2]
+    """(n,) which of n images see a keypoint, or a sample outside of what is solid, that nothing solid hides.
+
+    The centres are those of all images of the scene.
+    """
+    ground = np.concatenate([samples, keypoints, centers[image_rows]])[:, :2]
     bounds = np.stack([ground.min(axis=0), ground.max(axis=0)])
-    solid = solid_in_scene(scene, points.rows_between(*bounds), bounds_m=bounds, column_m=column_m)
+    solid = solid_in_scene(scene, points.rows_between(*bounds), centers, bounds_m=bounds, column_m=column_m)
     places = np.concatenate([keypoints, samples[~solid.hold(samples)]])
     in_image = frustum_bits(np.ascontiguousarray(places.T), image_from_world, sizes_px)
-    free: NDArray[np.bool_] = np.any(solid.remove_hidden(in_image, centers, places), axis=1)
+    free: NDArray[np.bool_] = np.any(solid.remove_hidden(in_image, centers[image_rows], places), axis=1)
     return free
 
 

@@ -43,7 +43,7 @@ class ClusteringOptions:
     """
     visibility: BlockVisibility = BlockVisibility.FRUSTUM
     """`frustum` or `occluded`: an image joins a block if it sees a keypoint or sample of it in this sense. `occluded`
-    takes 1 to 4 % fewer images and 0.16 s a block of 180; the selection has about the same views and covers the same
+    takes 1 to 4 % fewer images and 0.14 s a block of 180; the selection has about the same views and covers the same
     surface with either."""
     min_cameras_per_cluster: int = 10
     """Clusters with fewer images are merged into a neighbour; [O] section 3."""

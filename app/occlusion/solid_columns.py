@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.occlusion.kernels import clear_blocked, lower_to_rays
-from app.scene.posed_scene import PosedScene, projection_centers
+from app.scene.posed_scene import PosedScene
 
 RAY_GAP = 0.5
 """In columns: how far before its point a ray ends, because the point's depth is uncertain."""
@@ -41,7 +41,9 @@ CLEARANCE = 1.5
 """In columns: how far below its lowest ray a column is still free. Rays end at keypoints, and roads have few: in a
 town with poor texture, 0.5 lost 37 % of the ground that cameras see within 20 m, and 1.5 loses 4 % of the low spots."""
 REACH = 2
-"""In columns: how far around a point columns may be as high as it is."""
+"""In columns: how far around a point columns may be as high as it is. With 1, plain walls stay open between windows
+3 m apart: 1 to 2 % more of the true pairs were kept in a town with poor texture, but the views selected for five of its
+clusters were 25.0 instead of 21.6 and covered 93.7 instead of 96.8 % of the surface."""
 MAX_SOLID = 1.5
 """In columns: what a line of sight may pass of solid, on the ground. A column at a wall is partly free, and keypoints
 lie up to their error behind it. With 1 rather than 1.5, 2 to 4 % more of the pairs are right, but up to 2 % more of
@@ -130,24 +132,29 @@ def solid_columns(
 
 
 def solid_in_scene(
-    scene: PosedScene, point_rows: NDArray[np.int64], *, bounds_m: NDArray[np.float64], column_m: float
+    scene: PosedScene,
+    point_rows: NDArray[np.int64],
+    centers: NDArray[np.float64],
+    *,
+    bounds_m: NDArray[np.float64],
+    column_m: float,
 ) -> SolidColumns:
     """Find what is solid in a rectangle of a scene, from all images that observe the points in it.
 
     Args:
         scene: A model with z up.
         point_rows: Rows of the points in the rectangle; more do no harm.
+        centers: (N, 3) `scene.centers_in_world`, which the caller has computed once.
         bounds_m: (2, 2) minimum and maximum (x, y) of the rectangle.
         column_m: Side of the columns.
     """
     starts = scene.track_offsets[point_rows]
     lengths = scene.track_offsets[point_rows + 1] - starts
     elements = np.repeat(starts - np.cumsum(lengths) + lengths, lengths) + np.arange(lengths.sum())
-    images, image_of_ray = np.unique(scene.track_images[elements], return_inverse=True)
     return solid_columns(
         scene.points_in_world[point_rows],
         np.repeat(np.arange(len(point_rows)), lengths),
-        projection_centers(scene.cam_from_world[images])[image_of_ray],
+        centers[scene.track_images[elements]],
         bounds_m=bounds_m,
         column_m=column_m,
     )

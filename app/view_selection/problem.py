@@ -95,7 +95,8 @@ class ProblemCutter:
         """What is solid in the rectangle around a cluster and its views, also by what other images observe there."""
         ground = np.concatenate([boxes.reshape(-1, 3), self._centers[image_rows]])[:, :2]
         bounds = np.stack([ground.min(axis=0), ground.max(axis=0)])
-        return solid_in_scene(self._scene, self._points.rows_between(*bounds), bounds_m=bounds, column_m=spacing)
+        rows = self._points.rows_between(*bounds)
+        return solid_in_scene(self._scene, rows, self._centers, bounds_m=bounds, column_m=spacing)
 
     def _points_in(self, boxes: NDArray[np.float64]) -> NDArray[np.int64]:
         """Rows of the points in a cluster's padded cells, in the order of their coordinates."""
