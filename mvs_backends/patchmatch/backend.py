@@ -134,7 +134,7 @@ def _search_view(
             cost=np.full(shape, 2, np.float32),
             view=np.full(shape, -1, np.int8),
         )
-    geometric = number > 0 and options.geometric_weight > 0
+    geometric = number > 0 and (options.geometric_weight > 0 or options.planar_prior)
 
     def previous(source: int) -> tuple[NDArray[np.float32], int]:
         return _load(_kept_file(folder, number - 1, source)).plane, _level(options, number - 1)
@@ -153,13 +153,14 @@ def _search_view(
     else:
         coarse = _load(_kept_file(folder, number - 1, view))
         start = upsampled(coarse, images.get(view, _level(options, number - 1))[0], reference)
+    if number > 0 and options.planar_prior:
+        start = search.with_planes(start)
     found = search.sweep(start, options.iterations[number], random_depth=number == 0)
-    if number == 0 and options.prior_iterations > 0:
-        found = search.with_prior(found).sweep(
-            found, options.prior_iterations, random_depth=False, first_iteration=options.iterations[0]
-        )
-    if number == len(options.iterations) - 1 and options.smoothing_radius_px > 0:
-        found = search.smoothed(found, options.smoothing_radius_px)
+    if number == len(options.iterations) - 1:
+        if number > 0 and options.planar_prior:
+            found = search.with_planes(found)
+        if options.smoothing_radius_px > 0:
+            found = search.smoothed(found, options.smoothing_radius_px)
     return found
 
 
@@ -179,7 +180,6 @@ def _reference(camera: LevelCamera, grey: NDArray[np.uint8], limits: NDArray[np.
         padded_grey=np.pad(grey, PADDING, mode="edge"),
         inverse_range=limits,
         intrinsics=np.array([calibration[0, 0], calibration[1, 1], calibration[0, 2], calibration[1, 2]], np.float32),
-        prior=np.zeros((0, 0, 3), np.float32),
     )
 
 
@@ -213,7 +213,7 @@ def _kept_folder(job: MvsJob, options: PatchMatchOptions, seed: int) -> Path:
     digest = hashlib.sha256(job.boxes_in_world.tobytes() + job.points_in_world.tobytes())
     for view in job.views:
         digest.update(view.name.encode() + view.calibration.tobytes() + view.cam_from_world.tobytes())
-    made_by = json.dumps([1, asdict(options), seed, job.sources, digest.hexdigest()], sort_keys=True)
+    made_by = json.dumps([2, asdict(options), seed, job.sources, digest.hexdigest()], sort_keys=True)
     folder = job.workspace / "stereo" / "patchmatch"
     label = folder / "made_by.json"
     if folder.exists() and not (label.exists() and label.read_text() == made_by):

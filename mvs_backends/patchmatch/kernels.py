@@ -21,7 +21,6 @@ from mvs_backends.patchmatch.cost.kernels import (
     angle_factor,
     facing,
     geometric_error,
-    prior_term,
     px_per_inverse_depth,
     sample_reference,
     view_cost,
@@ -34,8 +33,6 @@ _TWO = np.float32(2)
 _TINY = np.float32(1e-12)
 _NUM_AREAS = 8
 _MIN_FACING = np.float32(0.1)
-# Of a plane that no texture confirms: worse than any that the prior may be made from, good enough to be kept.
-_PRIOR_COST = np.float32(0.4)
 _GOOD_COST = np.float32(0.8)
 _GOOD_COST_DECAY = np.float32(90)
 _BAD_COST = np.float32(1.2)
@@ -83,8 +80,6 @@ class Search(NamedTuple):
     """Largest change of a refined normal, as a fraction of its length."""
     min_angle_rad: np.float32
     """Triangulation angle below which a view loses weight."""
-    prior_depth_px: np.float32
-    """lambda_d of ACMP, as a shift in the source view."""
     random_depth: int
     """1: also try a hypothesis from the whole interval."""
 
@@ -275,17 +270,6 @@ def _hypothesis_cost(x, y, plane, variance, bound, num_chosen, sources, window, 
 
 
 @njit(forceinline=True, **COMPILED)
-def _score(cost, x, y, plane, reference, search, rate):
-    """What is minimised: the cost, or with a planar prior ACMP's negative log posterior."""
-    if reference.prior.shape[0] == 0 or reference.prior[y, x, 0] <= _ZERO:
-        return cost
-    term = prior_term(
-        x, y, plane[0], plane[1], plane[2], reference.prior[y, x], rate, search.prior_depth_px, reference.intrinsics
-    )
-    return cost * cost / np.float32(2 * 0.18 * 0.18) + term
-
-
-@njit(forceinline=True, **COMPILED)
 def _propose(kind, x, y, low, high, rate, draw, state, reference, search, scratch):
     """Write the refinement hypothesis number `kind` of scratch.best into scratch.trial; False if there is none."""
     plane, out = scratch.best, scratch.trial
@@ -327,22 +311,13 @@ def _propose(kind, x, y, low, high, rate, draw, state, reference, search, scratc
 
 
 @njit(forceinline=True, **COMPILED)
-def _take_prior(x, y, state, reference):
-    """Without texture only the prior knows; what a coarser level took from it stays."""
-    if reference.prior.shape[0] > 0 and reference.prior[y, x, 0] > _ZERO:
-        state.cost[y, x] = _PRIOR_COST
-        for i in range(3):
-            state.plane[y, x, i] = reference.prior[y, x, i]
-
-
-@njit(forceinline=True, **COMPILED)
-def _compare_candidates(x, y, count, num_chosen, rate, reference, sources, search, scratch):
-    """Copy the candidate of the best score into scratch.best; return its score and cost."""
+def _compare_candidates(x, y, count, num_chosen, sources, search, scratch):
+    """Copy the candidate of the least cost into scratch.best; return its cost."""
     candidates, costs, weights, chosen = scratch.candidates, scratch.costs, scratch.weights, scratch.chosen
     total = _ZERO
     for k in range(num_chosen):
         total += weights[chosen[k]]
-    best_score, best_cost = np.float32(1e9), MAX_COST
+    best_cost = np.float32(1e9)
     for i in range(count):
         cost = _ZERO
         for k in range(num_chosen):
@@ -354,12 +329,11 @@ def _compare_candidates(x, y, count, num_chosen, rate, reference, sources, searc
                 )
             cost += weights[j] * one
         cost /= total
-        score = _score(cost, x, y, candidates[i], reference, search, rate)
-        if score < best_score:
-            best_score, best_cost = score, cost
+        if cost < best_cost:
+            best_cost = cost
             for c in range(3):
                 scratch.best[c] = candidates[i, c]
-    return best_score, best_cost
+    return best_cost
 
 
 @njit(forceinline=True, **COMPILED)
@@ -367,7 +341,6 @@ def _update_pixel(x, y, variance, state, reference, sources, window, search, scr
     """One step of the search at a textured pixel."""
     candidates, costs, best, trial = scratch.candidates, scratch.costs, scratch.best, scratch.trial
     num_views = sources.warp.shape[0]
-    has_prior = reference.prior.shape[0] > 0 and reference.prior[y, x, 0] > _ZERO
     low, high = reference.inverse_range[y, x, 0], reference.inverse_range[y, x, 1]
     count = _gather_candidates(x, y, state, low, high, scratch)
     own = candidates[0, 0]
@@ -375,27 +348,20 @@ def _update_pixel(x, y, variance, state, reference, sources, window, search, scr
     for j in range(num_views):
         rate = max(rate, px_per_inverse_depth(j, x, y, own, sources.warp))
     count = _merge_candidates(count, rate, scratch)
-    if has_prior:
-        for c in range(3):
-            candidates[count, c] = reference.prior[y, x, c]
-        scratch.multiplicity[count] = 1
-        count += 1
     for i in range(count):
         w, a, b = candidates[i, 0], candidates[i, 1], candidates[i, 2]
         for j in range(num_views):
             costs[i, j] = view_cost(j, x, y, w, a, b, variance, sources, window, scratch)
     num_chosen = _select_views(x, y, own, count, state.best_view[y, x], reference, sources, search, scratch)
-    score, cost = _compare_candidates(x, y, count, num_chosen, rate, reference, sources, search, scratch)
+    cost = _compare_candidates(x, y, count, num_chosen, sources, search, scratch)
     draw = _seed(search.seed, search.iteration, y * state.cost.shape[1] + x)
     for kind in range(5):
         draw = random_bits(draw + np.uint64(0x9E3779B97F4A7C15))
         if not _propose(kind, x, y, low, high, rate, draw, state, reference, search, scratch):
             continue
-        bound = np.float32(1e9) if has_prior else cost
-        trial_cost = _hypothesis_cost(x, y, trial, variance, bound, num_chosen, sources, window, search, scratch)
-        trial_score = _score(trial_cost, x, y, trial, reference, search, rate)
-        if trial_score < score:
-            score, cost = trial_score, trial_cost
+        trial_cost = _hypothesis_cost(x, y, trial, variance, cost, num_chosen, sources, window, search, scratch)
+        if trial_cost < cost:
+            cost = trial_cost
             for c in range(3):
                 best[c] = trial[c]
     for c in range(3):
@@ -415,9 +381,7 @@ def sweep_rows(first_row, last_row, colour, state, reference, sources, window, s
             if reference.inverse_range[y, x, 1] <= _ZERO:
                 continue
             variance = sample_reference(reference.padded_grey, x, y, window, scratch.weight, scratch.centred)
-            if variance < MIN_VARIANCE:
-                _take_prior(x, y, state, reference)
-            else:
+            if variance >= MIN_VARIANCE:
                 _update_pixel(x, y, variance, state, reference, sources, window, search, scratch)
 
 

@@ -19,8 +19,8 @@ class PatchMatchOptions:
     """Sweeps per level, coarse to fine; each level halves the pixel size."""
     finest_level: int = 0
     """Halvings of the image at which the search ends; its maps are upsampled."""
-    prior_iterations: int = 2
-    """Further sweeps at the coarsest level with the planar prior. ACMP: 3. 0: no planar prior."""
+    planar_prior: bool = True
+    """Fit planes to the credible pixels of evenly coloured regions, and give them to the others there."""
     num_random: int = 8
     """Random hypotheses per pixel at the start, beside the one interpolated from sparse points. ACMM: 1."""
     geometric_weight: float = 0.05
@@ -29,27 +29,24 @@ class PatchMatchOptions:
     """Truncation delta of the reprojection error. ACMM: 3."""
     sigma_space_px: float = 5.0
     """Bilateral weight: spread over distance. ACMM: 5."""
-    sigma_grey: float = 10.0
+    sigma_grey: float = 20.0
     """Bilateral weight: spread over grey values of 0 to 255. ACMM: 3 for COLMAP-like weights."""
     min_angle_deg: float = 1.5
     """Source views with a smaller triangulation angle lose weight quadratically. 0: no."""
     max_cost: float = 0.5
     """Pixels of a larger final cost get no depth."""
     max_prior_cost: float = 0.15
-    """Pixels of at most this cost support the planar prior. ACMP: 0.1."""
-    prior_cell_px: int = 5
-    """One support pixel per cell of this size. ACMP: 5."""
+    """Pixels of at most this cost, whose depth two source views confirm, support the planar prior. ACMP: 0.1."""
     smoothing_radius_px: int = 2
     """At the end, each plane is averaged with those that agree within so many pixels. 0: no."""
     min_speckle_px: int = 40
     """Smaller connected pieces of a depth map are removed."""
 
     def __post_init__(self) -> None:
-        for field in ("num_source_views", "max_cost_views", "num_random", "prior_cell_px"):
+        for field in ("num_source_views", "max_cost_views", "num_random"):
             if getattr(self, field) < 1:
                 raise ValueError(f"{field} must be at least 1, not {getattr(self, field)}")
         for field in (
-            "prior_iterations",
             "geometric_weight",
             "min_angle_deg",
             "max_prior_cost",
@@ -68,7 +65,7 @@ class PatchMatchOptions:
 PRESETS = {
     Preset.PREVIEW: PatchMatchOptions(num_source_views=4, max_cost_views=3, iterations=(5, 3), finest_level=1),
     Preset.NORMAL: PatchMatchOptions(),
-    Preset.HIGH: PatchMatchOptions(num_source_views=9, max_cost_views=6, iterations=(8, 5, 4), prior_iterations=3),
+    Preset.HIGH: PatchMatchOptions(num_source_views=9, max_cost_views=6, iterations=(8, 5, 4)),
 }
 
 

@@ -1,20 +1,31 @@
-"""Planes interpolated between reliable points: the start from sparse points, and ACMP's planar prior."""
+"""Planes interpolated between sparse points, and the planar prior of evenly coloured regions."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-_MAX_GREY_STEP = 25
+# Grey values per pixel, of 255.
+_MAX_GRADIENT = 3.0
+_MIN_REGION_PX = 80
+_MIN_POINTS = 30
+_MAX_SCORED_POINTS = 2000
+_NUM_TRIALS, _NUM_REFINEMENTS = 60, 3
+_MIN_DETERMINANT = 1e-3
+_MAX_PLANES = 3
+# Of a region's credible pixels.
+_MIN_SHARE_FIRST, _MIN_SHARE_OTHER = 0.4, 0.15
+# A point lies on a plane, and a plane is known at a pixel, to the smaller of the two.
+_MAX_ERROR_PX, _MAX_RELATIVE_ERROR = 2.0, 0.015
+# So many pixels' errors are alike, as their windows overlap.
+_CORRELATED_PX = 25
 
 
 def interpolated_planes(
-    points: NDArray[np.float32],
-    inverse_depths: NDArray[np.float32],
-    width: int,
-    height: int,
-    grey: NDArray[np.uint8] | None = None,
+    points: NDArray[np.float32], inverse_depths: NDArray[np.float32], width: int, height: int
 ) -> NDArray[np.float32]:
     """Planes through the Delaunay triangles of points in the image.
 
@@ -23,8 +34,6 @@ def interpolated_planes(
         inverse_depths: (P,)
         width: of the image.
         height: of the image.
-        grey: (height, width) the image. If given, pixels whose grey value differs from all three corners of their
-            triangle by more than 25 get no plane: between two houses that is the sky.
 
     Returns:
         (height, width, 3) inverse depth and its slopes along x and y; 0 outside the points' convex hull.
@@ -61,28 +70,124 @@ def interpolated_planes(
     planes[y, x, 1], planes[y, x, 2] = slope_x[at], slope_y[at]
     planes[y, x, 0] = values[at, 0] + slope_x[at] * (x - corners[at, 0, 0]) + slope_y[at] * (y - corners[at, 0, 1])
     planes[planes[..., 0] <= 0] = 0.0
-    if grey is not None:
-        at_corners = grey[corners[:, :, 1], corners[:, :, 0]].astype(np.int32)[at]
-        alike = np.abs(at_corners - grey[y, x].astype(np.int32)[:, None]).min(axis=1) <= _MAX_GREY_STEP
-        planes[y[~alike], x[~alike]] = 0.0
     return planes
 
 
-def support_points(
-    cost: NDArray[np.float32], inverse_depth: NDArray[np.float32], cell_px: int, max_cost: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """ACMP's credible points: the pixel of least cost of each cell, if that is at most `max_cost`.
+def even_regions(grey: NDArray[np.uint8]) -> tuple[NDArray[np.int32], list[tuple[slice, slice]]]:
+    """Connected pieces of the image without edges.
 
     Returns:
-        (P, 2) pixels and (P,) inverse depths.
+        (H, W) number of the region that a pixel belongs to, or -1, and the box around each region.
     """
-    height, width = cost.shape
-    rows, columns = -(-height // cell_px), -(-width // cell_px)
-    padded = np.full((rows * cell_px, columns * cell_px), np.inf, np.float32)
-    padded[:height, :width] = np.where(inverse_depth > 0, cost, np.inf)
-    cells = padded.reshape(rows, cell_px, columns, cell_px).transpose(0, 2, 1, 3).reshape(rows, columns, -1)
-    best = cells.argmin(axis=-1)
-    good = np.take_along_axis(cells, best[..., None], axis=-1)[..., 0] <= max_cost
-    y = (np.arange(rows)[:, None] * cell_px + best // cell_px)[good]
-    x = (np.arange(columns)[None, :] * cell_px + best % cell_px)[good]
-    return np.stack([x, y], axis=1).astype(np.float32), inverse_depth[y, x]
+    smooth = cv2.GaussianBlur(grey, (0, 0), 0.8).astype(np.float32)
+    gradient = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)) / 8
+    even = (gradient < _MAX_GRADIENT).astype(np.uint8)
+    count, label, statistics, _ = cv2.connectedComponentsWithStats(even, connectivity=4)
+    large = np.flatnonzero(statistics[1:, cv2.CC_STAT_AREA] >= _MIN_REGION_PX) + 1
+    number = np.full(count, -1, np.int32)
+    number[large] = np.arange(len(large))
+    boxes = [(slice(top, top + height), slice(left, left + width)) for left, top, width, height, _ in statistics[large]]
+    return number[label], boxes
+
+
+def region_planes(
+    regions: NDArray[np.int32],
+    boxes: Sequence[tuple[slice, slice]],
+    inverse_depth: NDArray[np.float32],
+    credible: NDArray[np.bool_],
+    rate: NDArray[np.float32],
+) -> NDArray[np.float32]:
+    """Planes of evenly coloured regions, from their credible pixels.
+
+    ACMP (Xu & Tao 2020, section 3.2) takes the triangles between credible pixels for planes. Those are as steep as two
+    neighbours' errors make them, and span what doesn't belong together; here each region gets the planes that most of
+    its credible pixels agree on, found by random sampling, as TAPA-MVS (Romanoni & Matteucci 2019, section 3.2) does
+    for superpixels. A plane reaches as far as its own points determine it.
+
+    Args:
+        regions: (H, W) and
+        boxes: as `even_regions` returns them.
+        inverse_depth: (H, W)
+        credible: (H, W) pixels whose depth is to be relied upon.
+        rate: (H, W) pixels in a source view per unit of inverse depth.
+
+    Returns:
+        (H, W, 3) inverse depth and its slopes along x and y; 0 where no plane is known.
+    """
+    planes = np.zeros((*regions.shape, 3), np.float32)
+    num_credible = np.bincount(regions[credible & (regions >= 0)], minlength=len(boxes))
+    generator = np.random.default_rng(0)
+    for region in np.flatnonzero(num_credible >= _MIN_POINTS).tolist():
+        box = boxes[region]
+        member = regions[box] == region
+        _fit_region(
+            member, credible[box] & member, inverse_depth[box].astype(np.float64), rate[box], planes[box], generator
+        )
+    return planes
+
+
+def _fit_region(
+    member: NDArray[np.bool_],
+    credible: NDArray[np.bool_],
+    inverse_depth: NDArray[np.float64],
+    rate: NDArray[np.float32],
+    planes: NDArray[np.float32],
+    generator: np.random.Generator,
+) -> None:
+    """Write the planes of one region; where it has several, each pixel's is that of the nearest point."""
+    rows, columns = np.nonzero(credible)
+    points = np.stack([np.ones(len(rows)), columns / 100, rows / 100], axis=1)
+    w = inverse_depth[rows, columns]
+    # Two pixels are much where parallax is little: far away almost anything would lie on one plane.
+    rate = np.maximum(rate[rows, columns], _MAX_ERROR_PX / (_MAX_RELATIVE_ERROR * w))
+    remaining = np.arange(len(points))
+    found, distances = [], []
+    for number in range(_MAX_PLANES):
+        share = _MIN_SHARE_OTHER if number else _MIN_SHARE_FIRST
+        inliers = _largest_plane(points[remaining], w[remaining], rate[remaining], generator)
+        if len(inliers) < max(_MIN_POINTS, share * len(points)):
+            break
+        chosen = remaining[inliers]
+        remaining = np.delete(remaining, inliers)
+        found.append(chosen)
+        away = np.ones(member.shape, np.uint8)
+        away[rows[chosen], columns[chosen]] = 0
+        distances.append(cv2.distanceTransform(away, cv2.DIST_L2, 3))
+        if len(remaining) < _MIN_POINTS:
+            break
+    if not found:
+        return
+    nearest = np.argmin(distances, axis=0)
+    for number, chosen in enumerate(found):
+        own = points[chosen]
+        plane = np.linalg.lstsq(own, w[chosen], rcond=None)[0]
+        spread = np.std((own @ plane - w[chosen]) * rate[chosen])
+        covariance = np.linalg.inv(own.T @ own) * spread**2 * _CORRELATED_PX
+        y, x = np.nonzero(member & (nearest == number))
+        there = np.stack([np.ones(len(x)), x / 100, y / 100], axis=1)
+        known = np.einsum("pi,ij,pj->p", there, covariance, there) < _MAX_ERROR_PX**2
+        y, x = y[known], x[known]
+        planes[y, x, 0] = there[known] @ plane
+        planes[y, x, 1:] = plane[1:] / 100
+
+
+def _largest_plane(
+    points: NDArray[np.float64], w: NDArray[np.float64], rate: NDArray[np.float32], generator: np.random.Generator
+) -> NDArray[np.int64]:
+    """Indices of the points of the plane that most points lie on, by random sampling and refinement."""
+    drawn = generator.integers(len(points), size=(_NUM_TRIALS, 3))
+    corners = points[drawn]
+    solvable = np.abs(np.linalg.det(corners)) > _MIN_DETERMINANT
+    if not solvable.any():
+        return np.zeros(0, np.int64)
+    trials = np.linalg.solve(corners[solvable], w[drawn[solvable], None])[..., 0]
+    scored = np.unique(np.linspace(0, len(points) - 1, _MAX_SCORED_POINTS).astype(np.int64))
+    errors = np.abs(trials @ points[scored].T - w[scored]) * rate[scored]
+    plane = trials[np.argmax((errors < _MAX_ERROR_PX).sum(axis=1))]
+    inliers = np.zeros(0, np.int64)
+    for _ in range(_NUM_REFINEMENTS):
+        inliers = np.flatnonzero(np.abs(points @ plane - w) * rate < _MAX_ERROR_PX)
+        if len(inliers) < _MIN_POINTS:
+            break
+        plane = np.linalg.lstsq(points[inliers], w[inliers], rcond=None)[0]
+    return inliers

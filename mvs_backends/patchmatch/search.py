@@ -15,12 +15,14 @@ from mvs_backends.patchmatch.cost.kernels import PADDING, Reference, Sources, Wi
 from mvs_backends.patchmatch.geometry import LevelCamera, level_camera, warp
 from mvs_backends.patchmatch.images import ImageCache
 from mvs_backends.patchmatch.kernels import Search, State, initialise_rows, sweep_rows
-from mvs_backends.patchmatch.maps.kernels import smooth_rows, upsample
+from mvs_backends.patchmatch.maps.kernels import credible_rows, smooth_rows, upsample
 from mvs_backends.patchmatch.options import PatchMatchOptions
-from mvs_backends.patchmatch.prior import interpolated_planes, support_points
+from mvs_backends.patchmatch.prior import even_regions, region_planes
 
 _ROWS_PER_TASK = 8
 _MIN_SPARSE_POINTS = 20
+# Of a plane that no texture confirms: worse than a credible pixel's, good enough to be kept.
+_PLANE_COST = np.float32(0.4)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,7 +166,6 @@ class LevelSearch:
             perturbation_px=np.float32(max(2.0 * shrink, 0.3)),
             normal_perturbation=np.float32(max(0.5 * shrink, 0.06)),
             min_angle_rad=np.float32(np.deg2rad(options.min_angle_deg)),
-            prior_depth_px=np.float32(1.0),
             random_depth=int(random_depth),
         )
 
@@ -200,23 +201,37 @@ class LevelSearch:
             pass
         return Hypotheses(plane=result, cost=found.cost, view=found.view)
 
-    def with_prior(self, found: Hypotheses) -> LevelSearch:
-        """The same search with a planar prior from the reliable pixels of `found`."""
-        height, width = found.cost.shape
-        points, inverse_depths = support_points(
-            found.cost, found.plane[..., 0], self.options.prior_cell_px, self.options.max_prior_cost
-        )
+    def with_planes(self, found: Hypotheses) -> Hypotheses:
+        """Hypotheses with the planes of evenly coloured regions where they are not credible by themselves."""
         grey = self.reference.padded_grey[PADDING:-PADDING, PADDING:-PADDING]
-        prior = interpolated_planes(points, inverse_depths, width, height, grey)
+        regions, boxes = even_regions(grey)
+        credible, rate = np.empty(grey.shape, np.bool_), np.empty(grey.shape, np.float32)
+
+        def run(first_row: int) -> None:
+            last_row = min(first_row + _ROWS_PER_TASK, len(rate))
+            credible_rows(
+                first_row,
+                last_row,
+                regions >= 0,
+                found.plane,
+                np.float32(self.options.max_prior_cost),
+                self.reference,
+                self.sources,
+                self.window,
+                new_scratch(len(self.sources.width)),
+                credible,
+                rate,
+            )
+
+        for _ in self.executor.map(run, range(0, len(rate), _ROWS_PER_TASK)):
+            pass
+        planes = region_planes(regions, boxes, found.plane[..., 0], credible, rate)
         low, high = np.moveaxis(self.reference.inverse_range, -1, 0)
-        prior[(prior[..., 0] < low) | (prior[..., 0] > high)] = 0.0
-        return LevelSearch(
-            reference=self.reference._replace(prior=prior),
-            sources=self.sources,
-            window=self.window,
-            options=self.options,
-            seed=self.seed,
-            executor=self.executor,
+        taken = (planes[..., 0] > 0) & (planes[..., 0] >= low) & (planes[..., 0] <= high) & ~credible
+        return Hypotheses(
+            plane=np.where(taken[..., None], planes, found.plane),
+            cost=np.where(taken, np.minimum(found.cost, _PLANE_COST), found.cost),
+            view=found.view,
         )
 
 

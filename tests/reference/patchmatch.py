@@ -208,3 +208,27 @@ def view_weights(costs: Array, previous: int, iteration: int) -> Array:
         elif j == previous:
             weights[j] = 0.2
     return weights
+
+
+def px_per_inverse_depth(reference: Camera, source: Camera, x: int, y: int, w: float) -> float:
+    """How far the pixel's projection into the source view moves per unit of inverse depth."""
+    step = 1e-5
+    (x1, y1, _), (x2, y2, _) = (
+        project(source, point_on_plane(reference, x, y, np.array([v, 0, 0]), (x, y))) for v in (w - step, w + step)
+    )
+    return math.hypot(x2 - x1, y2 - y1) / (2 * step)
+
+
+def num_confirming(
+    reference: Camera, sources: list[Camera], maps: Array, x: int, y: int, plane: Array, max_cost: float, sigmas: Array
+) -> int:
+    """Source views where the patch matches, matches nowhere within 2 pixels, and whose own map agrees to a pixel."""
+    count = 0
+    for source, its_map in zip(sources, maps, strict=True):
+        step = np.array([2 / px_per_inverse_depth(reference, source, x, y, plane[0]), 0, 0])
+        cost, *others = (
+            patch_cost(reference, source, x, y, plane + shift, *sigmas) for shift in (0 * step, step, -step)
+        )
+        near = reprojection_error(reference, source, its_map, x, y, plane[0], 2.0) <= 0.5
+        count += near and cost <= max_cost and min(others) > cost + 0.1
+    return count

@@ -56,8 +56,11 @@ def plane_job(
     num_views: int = 4,
     seed: int = 0,
     num_points: int = 60,
+    bare: tuple[float, float] = (0.0, 0.0),
 ) -> MvsJob:
     """A dense workspace of views of the plane ``normal . X = offset``, all lengths times `scale`.
+
+    Where |x| and |y| are less than `bare`, the plane has no texture.
 
        x x x x      cameras side by side at z = 0, 0.5 apart, looking along z
         \\| |/
@@ -76,7 +79,9 @@ def plane_job(
         )
     (folder / "images" / "cam").mkdir(parents=True)
     for view in views:
-        grey = texture(_points(view, direction, distance), seed, scale)
+        seen = _points(view, direction, distance)
+        grey = texture(seen, seed, scale)
+        grey[(np.abs(seen[..., :2]) < np.array(bare) * scale).all(axis=-1)] = 128
         cv2.imwrite(str(folder / "images" / view.name), np.clip(np.round(grey), 0, 255).astype(np.uint8))
     rng = np.random.default_rng(seed + 1)
     surface = _points(views[num_views // 2], direction, distance).reshape(-1, 3)

@@ -24,7 +24,7 @@ from tests.reference.plane_scene import plane_job, true_depth
 ROOT = Path(__file__).resolve().parents[2]
 OPTIONS = MvsOptions()
 SLANTED = (0.35, -0.3, 1.0)
-QUICK = PatchMatchOptions(num_source_views=3, max_cost_views=3, iterations=(3, 1), prior_iterations=1, num_random=4)
+QUICK = PatchMatchOptions(num_source_views=3, max_cost_views=3, iterations=(3, 1), num_random=4)
 
 
 def run(job: MvsJob, *, num_threads: int = 2, options: MvsOptions = OPTIONS) -> list[tuple[NDArray, NDArray]]:
@@ -57,6 +57,22 @@ def test_depth_and_normal_of_a_textured_plane(tmp_path: Path, normal: tuple[floa
         assert np.mean(angle < 8.0) > 0.95
         np.testing.assert_allclose(np.linalg.norm(normals[known], axis=-1), 1.0, atol=1e-4)
         assert not normals[~known].any()
+
+
+def test_a_wall_without_texture_gets_the_plane_of_its_edges(tmp_path: Path) -> None:
+    found = {}
+    for prior in (False, True):
+        job = plane_job(tmp_path / str(prior), normal=SLANTED, bare=(1.2, 0.8))
+        estimate_maps(job=job, options=PatchMatchOptions(planar_prior=prior), seed=0, num_threads=2)
+        direction = np.asarray(SLANTED) / np.linalg.norm(SLANTED)
+        depth = read_map(job.depth_map_path(1))
+        grey = cv2.imread(str(job.image_path(1)), cv2.IMREAD_GRAYSCALE).astype(np.float32)
+        bare = cv2.erode((grey == 128).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        assert bare.sum() > 400
+        right = (depth > 0) & (np.abs(depth / true_depth(job.views[1], direction, 5.0) - 1) < 0.01)
+        found[prior] = right[bare].mean()
+    assert found[True] > 0.95
+    assert found[False] < 0.75
 
 
 def test_scaling_the_scene_scales_the_depth(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from mvs_backends.patchmatch import kernels as search
 from mvs_backends.patchmatch.cost import kernels as cost
 from mvs_backends.patchmatch.geometry import LevelCamera, depth_and_normal, warp
-from mvs_backends.patchmatch.maps.kernels import smooth_rows, upsample
+from mvs_backends.patchmatch.maps.kernels import credible_rows, smooth_rows, upsample
 from mvs_backends.patchmatch.options import PatchMatchOptions
 from mvs_backends.patchmatch.search import window
 from tests.reference import patchmatch as plain
@@ -42,7 +42,8 @@ def planes_near(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
     return np.concatenate([w[..., None], slopes], axis=-1).astype(np.float32)
 
 
-def scene(seed: int) -> Scene:
+def scene(seed: int, *, reach: float = 0.4, num_alike: int = 0) -> Scene:
+    """A reference and sources up to `reach` beside it; the first `num_alike` of them show the same image."""
     rng = np.random.default_rng(seed)
     calibration = np.array([[45.0, 0, WIDTH / 2], [0, 44.0, HEIGHT / 2], [0, 0, 1]])
     cameras = []
@@ -51,9 +52,10 @@ def scene(seed: int) -> Scene:
         turn = np.array([[0, -angles[2], angles[1]], [angles[2], 0, -angles[0]], [-angles[1], angles[0], 0]])
         rotation, _ = np.linalg.qr(np.eye(3) + turn)
         rotation *= np.sign(np.diag(rotation))
-        shift = rng.uniform(-0.4, 0.4, 3) if i else np.zeros(3)
+        shift = rng.uniform(-reach, reach, 3) if i else np.zeros(3)
         pose = np.concatenate([rotation, shift[:, None]], axis=1)
-        cameras.append(plain.Camera(calibration=calibration, pose=pose, grey=grey_image(rng)))
+        grey = cameras[0].grey if 0 < i <= num_alike else grey_image(rng)
+        cameras.append(plain.Camera(calibration=calibration, pose=pose, grey=grey))
     levels = [LevelCamera(width=WIDTH, height=HEIGHT, calibration=calibration, cam_from_world=c.pose) for c in cameras]
     maps = planes_near(rng, (NUM_SOURCES, HEIGHT, WIDTH))
     maps[rng.random(maps.shape[:3]) < 0.1] = 0
@@ -81,7 +83,6 @@ def scene(seed: int) -> Scene:
         padded_grey=np.pad(cameras[0].grey, cost.PADDING, mode="edge"),
         inverse_range=np.tile(np.array([0.15, 0.3], np.float32), (HEIGHT, WIDTH, 1)),
         intrinsics=np.array([45.0, 44.0, WIDTH / 2, HEIGHT / 2], np.float32),
-        prior=np.zeros((0, 0, 3), np.float32),
     )
     return Scene(cameras[0], cameras[1:], maps, reference, sources)
 
@@ -167,15 +168,36 @@ def test_smoothing() -> None:
     plane[rng.random((HEIGHT, WIDTH)) < 0.2] = 0
     rate = np.zeros((HEIGHT, WIDTH))
     for y, x in np.ndindex(HEIGHT, WIDTH):
-        for source in made.sources:
-            ends = [
-                plain.project(source, plain.point_on_plane(made.reference, x, y, np.array([w, 0, 0]), (x, y)))
-                for w in (plane[y, x, 0] - 1e-5, plane[y, x, 0] + 1e-5)
-            ]
-            rate[y, x] = max(rate[y, x], np.hypot(ends[1][0] - ends[0][0], ends[1][1] - ends[0][1]) / 2e-5)
+        if plane[y, x, 0] > 0:
+            rate[y, x] = max(
+                plain.px_per_inverse_depth(made.reference, source, x, y, plane[y, x, 0]) for source in made.sources
+            )
     found = np.empty_like(plane)
     smooth_rows(0, HEIGHT, 2, plane, made.kernel_reference, made.kernel_sources, found)
     np.testing.assert_allclose(found, plain.smoothed(plane.astype(float), rate, 2), atol=2e-4)
+
+
+def test_credible_pixels() -> None:
+    made = scene(3, reach=0.1, num_alike=2)
+    rng = np.random.default_rng(10)
+    plane = planes_near(rng, (HEIGHT, WIDTH))
+    wanted = np.zeros((HEIGHT, WIDTH), np.bool_)
+    wanted[8:-8:2, 10:-10:2] = True
+    credible, rate = np.empty((HEIGHT, WIDTH), np.bool_), np.empty((HEIGHT, WIDTH), np.float32)
+    max_cost, scratch = 0.6, cost.new_scratch(NUM_SOURCES)
+    views = made.kernel_reference, made.kernel_sources, WINDOW, scratch
+    credible_rows(0, HEIGHT, wanted, plane, np.float32(max_cost), *views, credible, rate)
+    assert not credible[~wanted].any()
+    sigmas = np.array([OPTIONS.sigma_space_px, OPTIONS.sigma_grey])
+    expected = np.zeros_like(credible)
+    for y, x in np.argwhere(wanted):
+        here = plane[y, x].astype(float)
+        confirming = plain.num_confirming(made.reference, made.sources, made.maps, x, y, here, max_cost, sigmas)
+        expected[y, x] = confirming >= 2
+    rates = [plain.px_per_inverse_depth(made.reference, source, x, y, here[0]) for source in made.sources]
+    assert rate[y, x] == pytest.approx(max(rates), rel=1e-3)
+    assert 10 < expected.sum() < wanted.sum() - 10
+    assert np.count_nonzero(credible != expected) <= 2
 
 
 def test_upsampling() -> None:
@@ -207,7 +229,6 @@ def test_random_numbers_are_splitmix64s() -> None:
 
 def test_candidates_are_the_best_of_each_area() -> None:
     rng = np.random.default_rng(6)
-    made = scene(0)
     state = search.State(
         plane=planes_near(rng, (HEIGHT, WIDTH)),
         cost=rng.uniform(0, 1, (HEIGHT, WIDTH)).astype(np.float32),
@@ -219,7 +240,6 @@ def test_candidates_are_the_best_of_each_area() -> None:
         count = search._gather_candidates(x, y, state, np.float32(0.17), np.float32(0.23), scratch)
         expected = plain.candidate_planes(state.plane, state.cost, limits, x, y)
         np.testing.assert_allclose(scratch.candidates[:count], expected, rtol=1e-5, atol=1e-7)
-    assert made.kernel_reference.prior.size == 0
 
 
 @pytest.mark.parametrize("previous", [-1, 1])
@@ -235,7 +255,6 @@ def test_view_weights(previous: int) -> None:
         perturbation_px=np.float32(1),
         normal_perturbation=np.float32(0.1),
         min_angle_rad=np.float32(0),
-        prior_depth_px=np.float32(1),
         random_depth=0,
     )
     scratch = cost.new_scratch(NUM_SOURCES)

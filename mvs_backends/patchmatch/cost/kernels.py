@@ -1,4 +1,4 @@
-"""Compiled cost of one plane hypothesis at one pixel: bilateral NCC, reprojection error, planar prior.
+"""Compiled cost of one plane hypothesis at one pixel: bilateral NCC, reprojection error.
 
 A hypothesis is a plane, kept per pixel as ``(w, a, b)``: the inverse depth at the pixel and its slopes along x and y.
 The inverse depth of a plane is linear in the image, so the hypothesis of a pixel holds at another one as
@@ -22,8 +22,8 @@ NUM_SAMPLES = 32
 """Samples of the matching window: 6 x 6 without its corners, a whole number of vector registers."""
 PADDING = 5
 """Reach of the matching window in pixels."""
-NUM_CANDIDATES = 10
-"""Hypotheses compared at a pixel at once: its own, 8 neighbours' and the planar prior's."""
+NUM_CANDIDATES = 9
+"""Hypotheses compared at a pixel at once: its own and 8 neighbours'."""
 MAX_COST = np.float32(2)
 """Cost 1 - NCC of a perfect anti-correlation; also of a view that doesn't see the patch."""
 MIN_VARIANCE = np.float32(2)
@@ -56,8 +56,6 @@ class Reference(NamedTuple):
     """(H, W, 2) smallest and largest inverse depth to search; both 0 where nothing is wanted."""
     intrinsics: NDArray[np.float32]
     """(4,) fx, fy, cx, cy."""
-    prior: NDArray[np.float32]
-    """(H, W, 3) planar prior, w = 0 where there is none; (0, 0, 3) without a planar prior."""
 
 
 class Sources(NamedTuple):
@@ -321,18 +319,3 @@ def facing(x, y, w, a, b, intrinsics):
     rx, ry = (np.float32(x) - intrinsics[2]) / intrinsics[0], (np.float32(y) - intrinsics[3]) / intrinsics[1]
     nz = w - nx * rx - ny * ry
     return w / np.sqrt((nx * nx + ny * ny + nz * nz) * (rx * rx + ry * ry + _ONE))
-
-
-@njit(forceinline=True, **COMPILED)
-def prior_term(x, y, w, a, b, prior, rate, depth_px, intrinsics):
-    """-ln(gamma + exp(...)) of ACMP eq. 9: what the planar prior adds to a hypothesis' score."""
-    shift = (w - prior[0]) * rate / depth_px
-    fx, fy = intrinsics[0], intrinsics[1]
-    rx, ry = (np.float32(x) - intrinsics[2]) / fx, (np.float32(y) - intrinsics[3]) / fy
-    ax, ay = a * fx, b * fy
-    az = w - ax * rx - ay * ry
-    bx, by = prior[1] * fx, prior[2] * fy
-    bz = prior[0] - bx * rx - by * ry
-    cosine = (ax * bx + ay * by + az * bz) / np.sqrt((ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz))
-    angle = np.sqrt(max(_TWO - _TWO * cosine, _ZERO)) / np.float32(0.0873)
-    return -np.log(_HALF + np.exp(-_HALF * (shift * shift + angle * angle)))

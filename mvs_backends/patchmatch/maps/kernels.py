@@ -8,11 +8,26 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from mvs_backends.patchmatch.cost.kernels import COMPILED, MAX_COST, PADDING, px_per_inverse_depth
+from mvs_backends.patchmatch.cost.kernels import (
+    COMPILED,
+    MAX_COST,
+    MIN_VARIANCE,
+    PADDING,
+    geometric_error,
+    px_per_inverse_depth,
+    sample_reference,
+    view_cost,
+)
 
 _ZERO = np.float32(0)
 _HALF = np.float32(0.5)
 _ONE = np.float32(1)
+_TWO = np.float32(2)
+_TINY = np.float32(1e-12)
+# e^2 / (1 + e) at one pixel.
+_MAX_GEOMETRIC_TERM = np.float32(0.5)
+_DISTINCT_STEP_PX, _DISTINCT_COST = np.float32(2), np.float32(0.1)
+_MIN_CONFIRMING = 2
 
 
 @njit(cache=True, **COMPILED)
@@ -90,3 +105,37 @@ def smooth_rows(first_row, last_row, radius, plane, reference, sources, out):
                     sum_a += weight * a
                     sum_b += weight * b
             out[y, x, 0], out[y, x, 1], out[y, x, 2] = sum_w / total, sum_a / total, sum_b / total
+
+
+@njit(cache=True, **COMPILED)
+def credible_rows(first_row, last_row, wanted, plane, max_cost, reference, sources, window, scratch, credible, rate):
+    """Find the wanted pixels that two source views confirm, in a band of rows.
+
+    A view confirms a hypothesis that costs at most `max_cost` there, and 0.1 more if moved by 2 pixels either way (on a
+    smooth shade or along an edge it costs little everywhere), if the view's own map reprojects to within a pixel of it.
+    `rate` gets the pixels per inverse depth in the view where they are most.
+    """
+    for y in range(first_row, last_row):
+        for x in range(plane.shape[1]):
+            w, a, b = plane[y, x, 0], plane[y, x, 1], plane[y, x, 2]
+            credible[y, x], rate[y, x] = False, _ZERO
+            if w <= _ZERO or not wanted[y, x]:
+                continue
+            variance = sample_reference(reference.padded_grey, x, y, window, scratch.weight, scratch.centred)
+            if variance < MIN_VARIANCE:
+                continue
+            confirming = 0
+            for j in range(sources.warp.shape[0]):
+                moves = px_per_inverse_depth(j, x, y, w, sources.warp)
+                rate[y, x] = max(rate[y, x], moves)
+                if geometric_error(j, x, y, w, sources, _TWO) > _MAX_GEOMETRIC_TERM:
+                    continue
+                cost = view_cost(j, x, y, w, a, b, variance, sources, window, scratch)
+                if cost > max_cost:
+                    continue
+                step = _DISTINCT_STEP_PX / max(moves, _TINY)
+                nearer = view_cost(j, x, y, w + step, a, b, variance, sources, window, scratch)
+                farther = view_cost(j, x, y, w - step, a, b, variance, sources, window, scratch)
+                if min(nearer, farther) > cost + _DISTINCT_COST:
+                    confirming += 1
+            credible[y, x] = confirming >= _MIN_CONFIRMING
