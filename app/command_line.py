@@ -48,7 +48,7 @@ def stage_command(
     """Register ``function(run, ...)`` as a command with a flag for every option of some sections of the configuration.
 
     The options in force are those of ``--config``, otherwise those that the workspace was last run with, and over them
-    the flags; they are kept in the workspace's ``config.toml``.
+    the flags; they are kept in the workspace's ``config.toml``. Only commands that are given images make workspaces.
     """
 
     def register(function: Callable[Concatenate[Run, P], None]) -> Callable[Concatenate[Run, P], None]:
@@ -70,9 +70,10 @@ def stage_command(
             kept = {p.name: arguments.pop(p.name) for p in own}
             if path is None:
                 path = default_workspace(kept["out"])
+            workspace = Workspace(path.absolute())
             settings = _settings(arguments, sections)
             run_safely(
-                functools.partial(_run_locked, function, Workspace(path.absolute()), kept, settings, arguments),
+                functools.partial(_run_locked, function, workspace, kept, settings, arguments),
                 verbosity=-1 if arguments["quiet"] else int(arguments["verbose"]),
             )
 
@@ -147,6 +148,10 @@ def _run_locked(
     kept_file = workspace.config_file if workspace.config_file.exists() else None
     config = load_config(arguments["config"] or kept_file, arguments["settings"] or [])
     config = update_config(config, settings, where="options")
+    if kept_file is None and "images" not in kept:
+        raise InputError(
+            f"{workspace.root} is no workspace; name the folder that `cityrecon full` or `cityrecon capture` made"
+        )
     with workspace.lock():
         try:
             log_to_file(workspace.log_file)
