@@ -1,10 +1,11 @@
 """Time and quality of the program and of other methods against the number of images, and a figure of the times.
 
 python -m benchmarks.peers OUTPUT.json FIGURE.svg [--limit-s 3600] [--images 250 500 1000 2000 4000 8000 12000]
-                           [--scaling SCALING.json]
+                           [--methods METHOD ...] [--scaling SCALING.json]
 
 The drives are like seq5, one for each number of images. A method isn't tried on more images once it has taken more
-than the limit, in CPU-seconds. ``--scaling`` adds the program's times from `benchmarks.scaling` to the figure.
+than the limit, in CPU-seconds. What OUTPUT.json holds from earlier runs stays. ``--scaling`` adds the program's times
+from `benchmarks.scaling` to the figure.
 
 Coverage: keypoints that at least two images of one cluster see, projecting into them from within 38 m. Matchability:
 images of a cluster that see 20 common keypoints with at least two others of it. Both on every fourth keypoint.
@@ -44,13 +45,14 @@ def main() -> None:
     parser.add_argument("figure", type=Path)
     parser.add_argument("--limit-s", type=int, default=3600)
     parser.add_argument("--images", type=int, nargs="+", default=[250, 500, 1000, 2000, 4000, 8000, 12000])
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
     parser.add_argument("--scaling", type=Path)
     arguments = parser.parse_args()
     print(describe_machine())
     print(f"{_DRIVE}; limit {arguments.limit_s} CPU-s")
     print("| images | method | CPU-s | clusters | views per cluster | coverage | matchability |")
     print("|---|---|---|---|---|---|---|")
-    rows: list[dict[str, float | str]] = []
+    rows = json.loads(arguments.output.read_text()) if arguments.output.exists() else []
     given_up: set[str] = set()
     for wanted in sorted(arguments.images):
         with tempfile.TemporaryDirectory() as scratch:
@@ -58,7 +60,7 @@ def main() -> None:
             store_scene(Path(scratch) / "model", Path(scratch) / "scene")
             scene = open_scene(Path(scratch) / "scene")
             seen = _seen_keypoints(scene)
-            for method in METHODS:
+            for method in arguments.methods:
                 if method in given_up:
                     continue
                 run = run_method(method, Path(scratch) / "model", arguments.limit_s)
