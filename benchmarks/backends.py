@@ -4,8 +4,8 @@
 
 TRUTH is a folder as `sample_data.render_street` writes it (`images`, `gt.ply`, `gt_mesh.ply`), MODEL a COLMAP model of
 it in the same world, WORK a folder to work in, emptied first. All images are one cluster, at their true poses. Without
-`--backends`, all that `cityrecon doctor` calls available. The maps of all are fused by our fusion with its defaults;
-for OpenMVS a second row scores the cloud that it fuses itself, neither masked nor cut to the region.
+`--backends`, all that `cityrecon doctor` calls available. The maps of all are fused by our fusion, once per number of
+`--views-agree`; for OpenMVS a further row scores the cloud that it fuses itself, neither masked nor cut to the region.
 
 Time is CPU-seconds, user and system, of the program and its children, with our kernels compiled before: of the maps,
 and of fusing them. Scores are accuracy / completeness / F in %, both sides thinned to 5 cm voxels, accuracy to the
@@ -63,6 +63,8 @@ def main() -> None:
     parser.add_argument("--max-image-size", type=int, default=0)
     parser.add_argument("--preset", type=Preset, default=Preset.NORMAL)
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--views-agree", type=int, nargs="+", default=[2, 3], help="FusionOptions.min_num_pixels")
+    parser.add_argument("--keep-maps", action="store_true", help="of an earlier call, and only fuse and score them")
     for program in ("openmvs", "colmap", "acmp"):
         parser.add_argument(f"--{program}-path", default="")
     arguments = parser.parse_args()
@@ -80,44 +82,53 @@ def main() -> None:
     print("|---" * (5 + len(_THRESHOLDS_M)) + "|")
     first, last = (int(part) for part in arguments.frames.split("-"))
     for name in names:
-        shutil.rmtree(arguments.work / name, ignore_errors=True)
+        work = arguments.work / name
+        if not arguments.keep_maps:
+            shutil.rmtree(work, ignore_errors=True)
         job = make_workspace(
-            arguments.work / name,
+            work,
             model=arguments.model,
             images=arguments.truth / "images",
             frames=range(first, last + 1),
             max_image_size_px=arguments.max_image_size,
         )
-        _run(name, job, options, arguments.work / name, arguments.truth, arguments.threads)
+        if not arguments.keep_maps:
+            _estimate(name, job, options, work, arguments.threads)
+        _score(name, job, work, arguments.truth, arguments.views_agree)
 
 
-def _run(name: str, job: MvsJob, options: MvsOptions, work: Path, truth: Path, num_threads: int) -> None:
+def _estimate(name: str, job: MvsJob, options: MvsOptions, work: Path, num_threads: int) -> None:
+    """Leave the maps, and how long they took in `maps.json`."""
     if name == "patchmatch":
         _compile(job)
     if name == "openmvs":
         options = dataclasses.replace(options, openmvs_path=str(_fusing_openmvs(work / "bin", options.openmvs_path)))
-    megapixels = sum(view.width * view.height for view in job.views) / 1e6
     started = _cpu_seconds()
     get_backend(name).estimate(job=job, options=options, num_threads=num_threads)
     maps_s = _cpu_seconds() - started
     own = work / "bin" / "own.json"
+    (work / "maps.json").write_text(json.dumps(maps_s - (json.loads(own.read_text()) if own.exists() else 0.0)))
+
+
+def _score(name: str, job: MvsJob, work: Path, truth: Path, views_agree: Sequence[int]) -> None:
+    maps_s = float(json.loads((work / "maps.json").read_text()))
+    megapixels = sum(view.width * view.height for view in job.views) / 1e6
+    for count in views_agree:
+        started = _cpu_seconds()
+        fusion = FusionOptions(min_num_pixels=count)
+        cloud = fuse_depth_maps(job.workspace, work / "scratch.ply", options=fusion, bounds=_EVERYWHERE)
+        fusion_s = _cpu_seconds() - started
+        write_ply(work / f"cloud{count}.ply", cloud)
+        _print_row(f"{name}, {count} views agree", maps_s, megapixels, fusion_s, cloud, truth)
+    own = work / "bin" / "own.json"
     if own.exists():
-        own_fusion_s = float(json.loads(own.read_text()))
-        maps_s -= own_fusion_s
-    started = _cpu_seconds()
-    cloud = fuse_depth_maps(job.workspace, work / "scratch.ply", options=FusionOptions(), bounds=_EVERYWHERE)
-    fusion_s = _cpu_seconds() - started
-    write_ply(work / "cloud.ply", cloud)
-    _print_row(name, maps_s, megapixels, fusion_s, cloud, truth)
-    if own.exists():
-        _print_row(
-            f"{name}, its own fusion", maps_s, megapixels, own_fusion_s, read_ply(own.with_suffix(".ply")), truth
-        )
+        seconds = float(json.loads(own.read_text()))
+        _print_row(f"{name}, its own fusion", maps_s, megapixels, seconds, read_ply(own.with_suffix(".ply")), truth)
 
 
 def _print_row(label: str, maps_s: float, megapixels: float, fusion_s: float, cloud: PointCloud, truth: Path) -> None:
     scores: Sequence[str] = ["" for _ in _THRESHOLDS_M]
-    if (truth / "gt.ply").exists():
+    if len(cloud) and (truth / "gt.ply").exists():
         found = compare_clouds(
             cloud,
             read_ply(truth / "gt.ply"),

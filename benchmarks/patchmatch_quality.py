@@ -28,19 +28,14 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
-from app.dense_job import prepare_workspace, write_dense_job
-from app.options import DensifyOptions
-from app.scene.point_index import PointIndex
-from app.scene.read_model import read_posed_scene
+from benchmarks.dense_workspace import make_workspace
 from benchmarks.machine import describe_machine
 from benchmarks.surface_texture import nearest, texture_of_samples
 from fusion.cloud import PointCloud, read_ply
 from fusion.compare import cloud_distances, mesh_distances
 from fusion.depth_fusion import FusionOptions, fuse_depth_maps
-from fusion.region import GroundRegion
 from fusion.thinning import thin
 from mvs_backends.base import MvsJob, Preset
 from mvs_backends.patchmatch.backend import estimate_maps
@@ -76,7 +71,14 @@ def main() -> None:
         changes = {key: ast.literal_eval(value) for key, value in _pairs(setting)}
         side_m = float(changes.pop("region", 0.0))
         options = dataclasses.replace(PRESETS[arguments.preset], **changes)
-        job = _job(arguments, range(first, last + 1), side_m)
+        job = make_workspace(
+            arguments.work,
+            model=arguments.model,
+            images=arguments.truth / "images",
+            frames=range(first, last + 1),
+            side_m=side_m,
+            max_image_size_px=arguments.max_image_size,
+        )
         if number == 0:
             _compile(job, options)
             is_plain = texture_of_samples(job, samples, arguments.truth / "gt_mesh.ply") < _LITTLE_TEXTURE
@@ -111,42 +113,6 @@ def _scores(
 def _pairs(setting: str) -> list[tuple[str, str]]:
     # Tuples hold commas themselves, so fields are separated by ';'.
     return [(key, value) for key, _, value in (part.partition("=") for part in setting.split(";") if part)]
-
-
-def _job(arguments: argparse.Namespace, frames: range, side_m: float) -> MvsJob:
-    """The dense workspace of the wanted frames; the region is a square around the cameras, or the sparse points."""
-    scene = read_posed_scene(arguments.model)
-    rows = [i for i, name in enumerate(scene.image_names) if int(Path(name).stem) in frames]
-    low, high = np.percentile(scene.points_in_world, [0.5, 99.5], axis=0)
-    corner, size = low[:2], high[:2] - low[:2]
-    if side_m:
-        corner, size = scene.centers_in_world[rows].mean(axis=0)[:2] - side_m / 2, np.full(2, side_m)
-    region = GroundRegion(
-        cells=((0, 0),),
-        origin_m=(float(corner[0]), float(corner[1])),
-        cell_size_m=(float(size[0]), float(size[1])),
-        z_range_m=(float(low[2]), float(high[2])),
-        padding_m=2.0,
-    )
-    folder = arguments.work / f"job{side_m:g}"
-    model = pycolmap.Reconstruction(str(arguments.model))
-    cameras = [model.cameras[camera_id] for camera_id in sorted(model.cameras)]
-    write_dense_job(
-        folder,
-        scene=scene,
-        points=PointIndex(scene.points_in_world),
-        image_rows=np.array(rows),
-        region=region,
-        cameras=cameras,
-        digests={},
-    )
-    return prepare_workspace(
-        folder,
-        arguments.work / "workspace",
-        image_root=arguments.truth / "images",
-        mask_root=None,
-        options=DensifyOptions(max_image_size_px=arguments.max_image_size),
-    )
 
 
 def _compile(job: MvsJob, options: PatchMatchOptions) -> None:
