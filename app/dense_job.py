@@ -215,7 +215,8 @@ def _write_mask(
 
 
 def _write_image(path: Path, pixels: NDArray[np.uint8]) -> None:
-    ok, encoded = cv2.imencode(path.suffix, pixels, [cv2.IMWRITE_JPEG_QUALITY, 98])
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 98] if path.suffix.lower() in (".jpg", ".jpeg") else []
+    ok, encoded = cv2.imencode(path.suffix, pixels, quality)
     if not ok:
         raise CityReconError(f"cannot encode {path}")
     with atomic_file(path) as partial:
