@@ -18,7 +18,7 @@ def write_log_chart(
     """Write lines of (x, y), both positive, over powers of ten."""
     xs = [x for line in series.values() for x, _ in line]
     ys = [y for line in series.values() for _, y in line]
-    x_range, y_range = _decades(xs), _decades(ys)
+    x_range, y_range = _exponents(xs), _exponents(ys)
 
     def place(x: float, y: float) -> tuple[float, float]:
         across = (math.log10(x) - x_range[0]) / (x_range[1] - x_range[0])
@@ -26,14 +26,14 @@ def write_log_chart(
         return _LEFT + across * (_WIDTH - _LEFT - _RIGHT), _HEIGHT - _BOTTOM - up * (_HEIGHT - _TOP - _BOTTOM)
 
     parts = []
-    for power in range(x_range[0], x_range[1] + 1):
+    for power in _powers(x_range):
         x, bottom = place(10.0**power, 10.0 ** y_range[0])
         parts.append(f'<line x1="{x:.1f}" y1="{_TOP}" x2="{x:.1f}" y2="{bottom:.1f}" stroke="#ddd"/>')
-        parts.append(f'<text x="{x:.1f}" y="{bottom + 18:.1f}" text-anchor="middle">{10.0**power:,g}</text>')
-    for power in range(y_range[0], y_range[1] + 1):
+        parts.append(f'<text x="{x:.1f}" y="{bottom + 18:.1f}" text-anchor="middle">{_number(power)}</text>')
+    for power in _powers(y_range):
         left, y = place(10.0 ** x_range[0], 10.0**power)
         parts.append(f'<line x1="{left:.1f}" y1="{y:.1f}" x2="{_WIDTH - _RIGHT}" y2="{y:.1f}" stroke="#ddd"/>')
-        parts.append(f'<text x="{left - 8:.1f}" y="{y + 4:.1f}" text-anchor="end">{10.0**power:,g}</text>')
+        parts.append(f'<text x="{left - 8:.1f}" y="{y + 4:.1f}" text-anchor="end">{_number(power)}</text>')
     for (name, line), color in zip(series.items(), _COLORS, strict=False):
         if not line:
             continue
@@ -57,7 +57,15 @@ def write_log_chart(
     )
 
 
-def _decades(values: Sequence[float]) -> tuple[int, int]:
-    """Powers of ten around all values."""
-    low, high = math.floor(math.log10(min(values))), math.ceil(math.log10(max(values)))
-    return low, max(high, low + 1)
+def _exponents(values: Sequence[float]) -> tuple[float, float]:
+    """Logarithms of a range around all values."""
+    return math.log10(min(values)) - 0.15, math.log10(max(values)) + 0.15
+
+
+def _powers(exponents: tuple[float, float]) -> range:
+    """Whole exponents in a range."""
+    return range(math.ceil(exponents[0]), math.floor(exponents[1]) + 1)
+
+
+def _number(power: int) -> str:
+    return f"{10**power:,}" if power >= 0 else f"{10.0**power:g}"

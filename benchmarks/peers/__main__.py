@@ -78,7 +78,8 @@ def main() -> None:
                 )
                 arguments.output.write_text(json.dumps(rows, indent=1) + "\n")
     series = {
-        method: [(row["num_images"], row["cpu_s"]) for row in rows if row["method"] == method] for method in METHODS
+        method: sorted((row["num_images"], row["cpu_s"]) for row in rows if row["method"] == method)
+        for method in METHODS
     }
     if arguments.scaling:
         largest = max(x for x, _ in series[OURS])
