@@ -24,8 +24,8 @@ class FusionOptions:
     """Largest distance between a pixel and the reprojection of its neighbour view's point. COLMAP's 2 merges
     neighbouring pixels: on the sample street it halves the points, and costs 2 of F at 5 cm."""
     max_depth_error: float = 0.005
-    """Largest relative difference of depths. COLMAP's 0.01, with 15 degrees between normals, costs 4 points of F at 5 cm
-    where poses are exact; much less than this loses points where they aren't."""
+    """Largest relative difference of depths. COLMAP's 0.01, with 15 degrees between normals, costs 4 points of F at
+    5 cm where poses are exact; much less than this loses points where they aren't."""
     max_normal_error_deg: float = 10.0
     """Largest angle between normals."""
     voxel_m: float = 0.0
