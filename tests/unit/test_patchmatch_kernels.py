@@ -43,7 +43,10 @@ def planes_near(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def scene(seed: int, *, reach: float = 0.4, num_alike: int = 0) -> Scene:
-    """A reference and sources up to `reach` beside it; the first `num_alike` of them show the same image."""
+    """A reference and sources up to `reach` beside it; the first `num_alike` of them show the same image.
+
+    Its left half is a smooth shade then.
+    """
     rng = np.random.default_rng(seed)
     calibration = np.array([[45.0, 0, WIDTH / 2], [0, 44.0, HEIGHT / 2], [0, 0, 1]])
     cameras = []
@@ -55,6 +58,8 @@ def scene(seed: int, *, reach: float = 0.4, num_alike: int = 0) -> Scene:
         shift = rng.uniform(-reach, reach, 3) if i else np.zeros(3)
         pose = np.concatenate([rotation, shift[:, None]], axis=1)
         grey = cameras[0].grey if 0 < i <= num_alike else grey_image(rng)
+        if i == 0 and num_alike:
+            grey[:, : WIDTH // 2] = 60 + 5 * np.arange(WIDTH // 2)
         cameras.append(plain.Camera(calibration=calibration, pose=pose, grey=grey))
     levels = [LevelCamera(width=WIDTH, height=HEIGHT, calibration=calibration, cam_from_world=c.pose) for c in cameras]
     maps = planes_near(rng, (NUM_SOURCES, HEIGHT, WIDTH))
@@ -196,7 +201,7 @@ def test_credible_pixels() -> None:
         expected[y, x] = confirming >= 2
     rates = [plain.px_per_inverse_depth(made.reference, source, x, y, here[0]) for source in made.sources]
     assert rate[y, x] == pytest.approx(max(rates), rel=1e-3)
-    assert 10 < expected.sum() < wanted.sum() - 10
+    assert 5 < expected.sum() < wanted.sum() - 10
     assert np.count_nonzero(credible != expected) <= 2
 
 
