@@ -139,7 +139,8 @@ def write_folder(folder: Path, job: MvsJob, sources: Mapping[int, Sequence[int]]
         # OpenCV, which reads them there, goes by the content of a file and not by its suffix.
         (folder / "images" / f"{number[view]:08d}.jpg").symlink_to(job.image_path(view).absolute())
         found = view_depth_range(job, view)
-        assert found is not None, "checked by the caller"
+        if found is None:
+            raise MvsError(f"{camera.name} doesn't see the region; leave it out of the reference views")
         (folder / "cams" / f"{number[view]:08d}_cam.txt").write_text(_camera_text(job, view, *found), encoding="ascii")
         count = len(sources[view])
         scores = "".join(f" {number[source]} {count - rank}" for rank, source in enumerate(sources[view]))

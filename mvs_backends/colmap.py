@@ -117,10 +117,9 @@ def _estimate(
 
 def _groups(job: MvsJob, views: Sequence[int]) -> list[tuple[tuple[float, float], list[int]]]:
     """Views by depth range to a factor of two: COLMAP takes one range per call."""
-    ranges = {view: view_depth_range(job, view) for view in views}
+    ranges = {view: found for view in views if (found := view_depth_range(job, view)) is not None}
     groups: dict[tuple[int, int], list[int]] = defaultdict(list)
     for view, found in ranges.items():
-        assert found is not None, "usable views have one"
         groups[math.floor(math.log2(found[0])), math.ceil(math.log2(found[1]))].append(view)
     result = []
     for _, group in sorted(groups.items()):

@@ -49,8 +49,9 @@ class OpenMvs(MvsBackend):
         views = range(len(job.views))
         if all(has_maps(job, view) for view in views):
             return
-        programs = [find_program(name, options.openmvs_path) for name in _PROGRAMS]
-        if None in programs:
+        found = [find_program(name, options.openmvs_path) for name in _PROGRAMS]
+        programs = [program for program in found if program is not None]
+        if len(programs) < len(_PROGRAMS):
             raise MvsError(self.availability(options).reason)
         folder = job.workspace / "stereo" / "openmvs"
         shutil.rmtree(folder, ignore_errors=True)
@@ -72,7 +73,6 @@ class OpenMvs(MvsBackend):
                 progress(min((num_first + num_written) // num_passes, len(job.views)), len(job.views))
 
         for program, arguments in zip(programs, _arguments(job, options, folder, num_threads), strict=True):
-            assert program is not None, "checked above"
             run_subprocess(
                 [program, "-w", folder, "--process-priority", "0", *arguments],
                 log_file=job.workspace / "stereo" / "openmvs.log",

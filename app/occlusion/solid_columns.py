@@ -148,13 +148,11 @@ def solid_in_scene(
         bounds_m: (2, 2) minimum and maximum (x, y) of the rectangle.
         column_m: Side of the columns.
     """
-    starts = scene.track_offsets[point_rows]
-    lengths = scene.track_offsets[point_rows + 1] - starts
-    elements = np.repeat(starts - np.cumsum(lengths) + lengths, lengths) + np.arange(lengths.sum())
+    ray_points, observing = scene.observations(point_rows)
     return solid_columns(
         scene.points_in_world[point_rows],
-        np.repeat(np.arange(len(point_rows)), lengths),
-        centers[scene.track_images[elements]],
+        ray_points,
+        centers[observing],
         bounds_m=bounds_m,
         column_m=column_m,
     )

@@ -91,6 +91,13 @@ class PosedScene:
     track_images: NDArray[np.int32]
     """(T,) rows in the image arrays, ascending and unique within a point."""
 
+    def observations(self, point_rows: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """(T,) place in ``point_rows`` and (T,) row of the image of each track element of some points."""
+        starts = self.track_offsets[point_rows]
+        lengths = self.track_offsets[point_rows + 1] - starts
+        elements = np.repeat(starts - np.cumsum(lengths) + lengths, lengths) + np.arange(lengths.sum())
+        return np.repeat(np.arange(len(point_rows)), lengths), self.track_images[elements]
+
     @property
     def image_from_world(self) -> NDArray[np.float64]:
         """(N, 3, 4) K [R | t]: homogeneous pixel coordinates (u z, v z, z) of points in the world."""

@@ -69,11 +69,8 @@ def _observations(
     scene: PosedScene, images: NDArray[np.integer], points: NDArray[np.integer]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Rows of points (ascending) and images, and pixels (n, 2), of what the images see of the points by track."""
-    lengths = np.diff(scene.track_offsets)[points]
-    starts = np.repeat(scene.track_offsets[points] - np.cumsum(lengths) + lengths, lengths)
-    elements = starts + np.arange(lengths.sum())
-    point_rows = np.repeat(points, lengths).astype(np.int64)
-    image_rows = scene.track_images[elements].astype(np.int64)
+    places, observing = scene.observations(points)
+    point_rows, image_rows = points[places].astype(np.int64), observing.astype(np.int64)
     wanted = np.isin(image_rows, images)
     point_rows, image_rows = point_rows[wanted], image_rows[wanted]
 

@@ -107,9 +107,7 @@ class ProblemCutter:
 
 def _observations(scene: PosedScene, image_rows: NDArray[np.int64], point_rows: NDArray[np.int64]) -> NDArray[np.int64]:
     """(T, 2) index in ``point_rows`` and in ``image_rows`` (ascending) of each track element between them."""
-    lengths = np.diff(scene.track_offsets)[point_rows]
-    starts = np.repeat(scene.track_offsets[point_rows] - np.cumsum(lengths) + lengths, lengths)
-    images = scene.track_images[starts + np.arange(lengths.sum())]
+    points, images = scene.observations(point_rows)
     views = np.minimum(np.searchsorted(image_rows, images), len(image_rows) - 1)
     here = image_rows[views] == images
-    return np.stack([np.repeat(np.arange(len(point_rows)), lengths)[here], views[here]], axis=1)
+    return np.stack([points[here], views[here]], axis=1)
