@@ -96,6 +96,31 @@ def test_the_solver_finds_the_optimum_of_brute_force(seed: int, num_views: int) 
 
 
 @many
+@given(seeds, st.integers(4, 11), st.data())
+def test_where_nothing_else_binds_the_quality_is_that_of_the_best_spread(
+    seed: int, num_views: int, data: st.DataObject
+) -> None:
+    rng = np.random.default_rng(seed)
+    size = data.draw(st.integers(3, num_views))
+    fixed = rng.random(num_views) < 0.2
+    fixed[np.flatnonzero(fixed)[size:]] = False
+    program = ViewProgram(
+        rows=CoveringRows(bits=np.empty((0, 1), dtype=np.uint64), bounds=np.empty(0, dtype=np.int64)),
+        matches=~np.eye(num_views, dtype=bool),
+        usable=np.ones(num_views, dtype=bool),
+        fixed=fixed,
+        n_match=2,
+        min_views=size,
+    )
+    worth = ViewQuality(quality=rng.uniform(0, 5, num_views), viewpoint=rng.integers(0, 4, num_views))
+    found = best_selection(program, smallest_selection(program, worth.quality, 1000), worth, 1000)
+    allowed = [s for s in _subsets(num_views) if s.sum() == size and s[fixed].all()]
+    assert found.selected.sum() == size
+    assert found.quality == pytest.approx(max(total_quality(s, worth) for s in allowed))
+    assert found.quality_bound == found.quality
+
+
+@many
 @given(seeds, st.integers(1, 10), st.integers(1, 4))
 def test_reduction_keeps_exactly_the_same_solutions(seed: int, num_views: int, n_vis: int) -> None:
     rng = np.random.default_rng(seed)

@@ -140,7 +140,13 @@ def test_point_index_finds_rows_in_a_rectangle(is_sorted: bool) -> None:
     if is_sorted:
         points = points[np.argsort(tile_keys(points))]
     index = PointIndex(points)
-    for low, high in (((-20, -3), (10, 140)), ((-310, -310), (310, 310)), ((7, 7), (9, 9)), ((900, 0), (950, 20))):
+    for low, high in (
+        ((-20, -3), (10, 140)),
+        ((-310, -310), (310, 310)),
+        ((-33, -47), (55, 71)),
+        ((7, 7), (9, 9)),
+        ((900, 0), (950, 20)),
+    ):
         inside = np.all((points[:, :2] >= low) & (points[:, :2] <= high), axis=1)
         found = index.rows_between(np.array(low, dtype=float), np.array(high, dtype=float))
         assert found.tolist() == np.flatnonzero(inside).tolist()
