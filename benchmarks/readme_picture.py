@@ -1,6 +1,6 @@
 """Draw the README's picture: input images above, the cloud and its distance to the ground truth below.
 
-python -m benchmarks.readme_picture WORKSPACE CLOUD.ply PICTURE.png
+python -m benchmarks.readme_picture WORKSPACE CLOUD.ply PICTURE.jpg
 """
 
 from __future__ import annotations
@@ -53,7 +53,9 @@ def main() -> None:
     below = np.hstack([left, right])
     above = cv2.resize(strip, (below.shape[1], round(strip.shape[0] * below.shape[1] / strip.shape[1])))
     picture.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(picture), np.vstack([above, below]), [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    # Single points are as small as a pixel: their colours need every one.
+    sampling = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    cv2.imwrite(str(picture), np.vstack([above, below]), [cv2.IMWRITE_JPEG_QUALITY, 88, *sampling])
 
 
 if __name__ == "__main__":
