@@ -68,6 +68,8 @@ class StreetOptions:
 
     def __post_init__(self) -> None:
         """Check ranges."""
+        if self.path not in list(PathKind):
+            raise ValueError(f"path must be one of {', '.join(PathKind)}, not {self.path!r}")
         for name in ("n_cameras", "n_frames", "frame_spacing_m", "width", "height", "truth_range_m", "truth_voxel_m"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be positive")

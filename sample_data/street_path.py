@@ -161,12 +161,12 @@ def plan_roads(kind: PathKind, length_m: float) -> RoadPlan:
         length_m: How far the vehicle drives. A loop closes, with a little overlap, if this suffices for a lap of 156 m.
     """
     quarter = (TURN_RADIUS_M * math.pi / 2, 1 / TURN_RADIUS_M)
-    if kind is PathKind.STRAIGHT:
+    if kind == PathKind.STRAIGHT:
         return _open_plan([(length_m, 0.0)])
-    if kind is PathKind.CORNER:
+    if kind == PathKind.CORNER:
         straight = max(3.0, (length_m - quarter[0]) / 2)
         return _open_plan([(straight, 0.0), quarter, (straight, 0.0)])
-    if kind is PathKind.ROUNDABOUT:
+    if kind == PathKind.ROUNDABOUT:
         return _roundabout_plan(length_m)
     sides = max(0.93 * length_m, 156.0) - 4 * quarter[0]
     half = sides / 4

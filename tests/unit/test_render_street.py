@@ -103,6 +103,18 @@ def test_the_drive_is_smooth_and_stays_on_the_road(kind: PathKind) -> None:
     assert min(ahead) > 3.0
 
 
+@pytest.mark.parametrize("kind", list(PathKind))
+def test_a_drive_can_be_named_by_a_plain_word(kind: PathKind) -> None:
+    options = StreetOptions(path=str(kind))  # type: ignore[arg-type]
+    of_word, of_kind = (plan_roads(path, 200.0).path for path in (options.path, kind))
+    np.testing.assert_array_equal(of_word.points, of_kind.points)
+
+
+def test_an_unknown_drive_is_refused() -> None:
+    with pytest.raises(ValueError, match="straight, corner, loop, roundabout, not 'square'"):
+        StreetOptions(path="square")  # type: ignore[arg-type]
+
+
 def test_a_loop_closes() -> None:
     path = plan_roads(PathKind.LOOP, 200.0).path
     (start, after_a_lap), headings = path.at(np.array([0.0, 0.93 * 200]))
