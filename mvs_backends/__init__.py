@@ -5,6 +5,9 @@ Other packages add theirs by an entry point of the group `cityrecon.mvs_backends
 
 from __future__ import annotations
 
+# Before pycolmap, which holds a zlib of its own: loaded first, parts of it would take the place of the system's, which
+# Python, and OpenCV for PNG files, use, and the process would abort.
+import zlib  # noqa: F401
 from collections.abc import Callable
 from functools import partial
 from importlib.metadata import EntryPoint, entry_points

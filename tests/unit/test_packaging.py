@@ -166,6 +166,7 @@ def test_the_links_of_the_readme_lead_somewhere() -> None:
     assert [target for target in links if not (ROOT / target).exists()] == []
 
 
-def test_png_files_can_be_written_where_pycolmap_is_imported_before_opencv() -> None:
-    script = "import app, pycolmap, cv2, numpy; cv2.imencode('.png', numpy.zeros((500, 500, 3), numpy.uint8))"
+@pytest.mark.parametrize("package", PACKAGES)
+def test_png_files_can_be_written_where_pycolmap_is_imported_before_opencv(package: str) -> None:
+    script = f"import {package}, pycolmap, cv2, numpy; cv2.imencode('.png', numpy.zeros((500, 500, 3), numpy.uint8))"
     subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT)
