@@ -99,10 +99,10 @@ def region_planes(
 ) -> NDArray[np.float32]:
     """Planes of evenly coloured regions, from their credible pixels.
 
-    ACMP (Xu & Tao 2020, section 3.2) takes the triangles between credible pixels for planes. Those are as steep as two
-    neighbours' errors make them, and span what doesn't belong together; here each region gets the planes that most of
-    its credible pixels agree on, found by random sampling, as TAPA-MVS (Romanoni & Matteucci 2019, section 3.2) does
-    for superpixels. A plane reaches as far as its own points determine it.
+    ACMP (Xu & Tao 2020) takes the triangles between credible pixels for planes. Those are as steep as two neighbours'
+    errors make them, and span what doesn't belong together; here each region gets the planes that most of its credible
+    pixels agree on, found by random sampling, as TAPA-MVS (Romanoni & Matteucci 2019) does for superpixels. A plane
+    reaches as far as its own points determine it.
 
     Args:
         regions: (H, W) and
