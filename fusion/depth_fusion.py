@@ -59,8 +59,14 @@ def fuse_depth_maps(
         The cloud; empty if the views agree on no point.
 
     Raises:
-        FusionError: the maps are missing or unreadable.
+        FusionError: a map is missing, or the workspace is unreadable.
     """
+    # COLMAP leaves out views without maps.
+    for name in (workspace / "stereo" / "fusion.cfg").read_text(encoding="utf-8").rstrip("\n").split("\n"):
+        for kind in ("depth_maps", "normal_maps"):
+            path = workspace / "stereo" / kind / f"{name}.geometric.bin"
+            if not path.exists():
+                raise FusionError(f"{path} is missing; remove {workspace} and run densify again")
     fusion = pycolmap.StereoFusionOptions()
     fusion.num_threads = 1
     fusion.min_num_pixels = options.min_num_pixels
