@@ -194,12 +194,12 @@ def _options_class(section: str) -> type:
 
 def _flags(section: str) -> list[inspect.Parameter]:
     options = _options_class(section)
-    defaults = options()
+    defaults, docs = options(), option_docs(options)
     flags = []
     for name, kind in option_types(options).items():
         flag = name.replace("_", "-")
         default = getattr(defaults, name)
-        text = option_docs(options)[name]
+        text = docs[name]
         if default is not None and default != "":
             text += f" Default: {' '.join(map(str, default)) if isinstance(default, tuple) else default}."
         spelling = f"--{flag}/--no-{flag}" if kind is bool else f"--{flag}"

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from app.errors import InputError
@@ -24,6 +24,10 @@ from app.scene.kernels import (
     index_points,
 )
 from app.scene.posed_scene import ImageNames, projection_centers
+
+if TYPE_CHECKING:
+    # Loaded only where a model is read: processes that select views have no use for it.
+    import pycolmap
 
 _IMAGE_HEADER = np.dtype([("id", "<u4"), ("quaternion", "<f8", 4), ("translation", "<f8", 3), ("camera", "<u4")])
 _POINT_HEADER = np.dtype([("id", "<u8"), ("position", "<f8", 3), ("color", "u1", 3), ("error", "<f8")])
@@ -69,6 +73,8 @@ def binary_model(model_dir: Path) -> Iterator[Path]:
         return
     if not all((model_dir / f"{stem}.txt").is_file() for stem in stems):
         raise InputError(f"no COLMAP model in {model_dir}: it needs cameras, images and points3D, as .bin or .txt")
+    import pycolmap
+
     with tempfile.TemporaryDirectory() as binary_dir:
         try:
             pycolmap.Reconstruction(str(model_dir)).write_binary(binary_dir)
@@ -207,6 +213,8 @@ def read_cameras(binary_dir: Path, model_dir: Path) -> dict[int, pycolmap.Camera
     Raises:
         InputError: cut off, or without usable size or parameters.
     """
+    import pycolmap
+
     path = binary_dir / "cameras.bin"
     content, position = path.read_bytes(), 8
     count = int.from_bytes(content[:8], "little")
@@ -232,6 +240,8 @@ def read_cameras(binary_dir: Path, model_dir: Path) -> dict[int, pycolmap.Camera
 
 def _pinholes(cameras: dict[int, pycolmap.Camera], model_dir: Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """fx, fy, cx, cy (M, 4) and sizes (M, 2) of the undistorted cameras."""
+    import pycolmap
+
     params, sizes = [], []
     for camera_id, camera in cameras.items():
         try:

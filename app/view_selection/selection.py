@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -200,7 +200,7 @@ def write_selections(selections: Iterable[Selection], folder: Path) -> None:
     """Write one JSON line per cluster, as they come."""
     with (folder / FILE_NAME).open("w", encoding="utf-8") as file:
         for selection in selections:
-            file.write(json.dumps(asdict(selection)) + "\n")
+            file.write(json.dumps(vars(selection), default=vars) + "\n")
 
 
 def read_selections(folder: Path) -> Iterator[Selection]:

@@ -13,10 +13,10 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from app.child_process import die_with_parent
 from app.clustering.clusters import Clustering
 from app.clustering.ground_plan import MapLabels
 from app.clustering.stage import SCENE_FOLDER
-from app.executor import die_with_parent
 from app.scene.read_model import open_scene
 from app.view_selection.explanation import ExplanationSums
 from app.view_selection.options import SelectionOptions
@@ -28,8 +28,8 @@ logger = logging.getLogger(__name__)
 
 PICTURES_FOLDER = "pictures"
 
-_BATCH = 8
-"""Clusters that a worker process is given at a time."""
+_BATCH, _BATCHES_AHEAD, _MAX_WAITING = 4, 2, 64
+"""Clusters solved at a time; batches that each worker process has been given; batches that wait for one before them."""
 _MIN_CLUSTERS_PER_WORKER = 64
 """A worker process takes about as long to start as it takes to solve this many clusters."""
 
@@ -56,8 +56,9 @@ def select(
     Raises:
         InputError: the clusters can't be read, or don't belong to the model beside them.
     """
-    selector = _Selector(clusters_dir, output_dir / PICTURES_FOLDER, options, labels or MapLabels())
-    num_images, num_clusters = len(selector.scene.image_names), len(selector.clusters)
+    arguments = (clusters_dir, output_dir / PICTURES_FOLDER, options, labels or MapLabels())
+    num_clusters = len(Clustering.read(clusters_dir).clusters)
+    num_images = len(open_scene(clusters_dir / SCENE_FOLDER).image_names)
     num_workers = max(1, min(num_workers, num_clusters // _MIN_CLUSTERS_PER_WORKER))
     totals = Counter[str]()
     explained = ExplanationSums()
@@ -65,7 +66,7 @@ def select(
     empty: list[str] = []
 
     def counted() -> Iterator[Selection]:
-        for done, selection in enumerate(_solved(selector, num_workers), start=1):
+        for done, selection in enumerate(_solved(arguments, num_clusters, num_workers), start=1):
             totals["selected"] += len(selection.image_names)
             totals["relaxed"] += bool(selection.relaxed)
             explained.add(selection.explanation)
@@ -109,22 +110,20 @@ class _Selector:
     """Selects the views of a folder's clusters, and draws some; each process has one of its own."""
 
     def __init__(self, clusters_dir: Path, pictures_dir: Path, options: SelectionOptions, labels: MapLabels) -> None:
-        self.arguments = (clusters_dir, pictures_dir, options, labels)
-        self.clusters = Clustering.read(clusters_dir).clusters
-        self.scene = open_scene(clusters_dir / SCENE_FOLDER)
-        self._cutter = ProblemCutter(self.scene)
-        self._drawn = _spread(len(self.clusters), options.max_pictures)
+        self._pictures_dir, self._options, self._labels = pictures_dir, options, labels
+        self._clusters = Clustering.read(clusters_dir).clusters
+        self._cutter = ProblemCutter(open_scene(clusters_dir / SCENE_FOLDER))
+        self._drawn = _spread(len(self._clusters), options.max_pictures)
 
     def select(self, batch: range) -> list[Selection]:
         return [self._select(number) for number in batch]
 
     def _select(self, number: int) -> Selection:
-        _, pictures_dir, options, labels = self.arguments
-        cluster = self.clusters[number]
-        problem = self._cutter.problem(cluster, options.visibility)
-        selection = select_views(problem, options)
+        cluster = self._clusters[number]
+        problem = self._cutter.problem(cluster, self._options.visibility)
+        selection = select_views(problem, self._options)
         if number in self._drawn:
-            write_picture(pictures_dir, problem, cluster, selection, labels)
+            write_picture(self._pictures_dir, problem, cluster, selection, self._labels)
         return selection
 
 
@@ -148,24 +147,36 @@ def _select_in_worker(batch: range) -> list[Selection]:
     return _selector.select(batch)
 
 
-def _solved(selector: _Selector, num_workers: int) -> Iterator[Selection]:
-    """Selections in the order of the clusters, with few of them in memory."""
-    total = len(selector.clusters)
-    batches = iter([range(first, min(first + _BATCH, total)) for first in range(0, total, _BATCH)])
-    if num_workers == 1:
-        for batch in batches:
-            yield from selector.select(batch)
-        return
-    with ProcessPoolExecutor(
-        num_workers,
+def _solved(arguments: tuple[Any, ...], num_clusters: int, num_workers: int) -> Iterator[Selection]:
+    """Selections in the order of the clusters, with few of them in memory; this process is one of the workers."""
+    batches = iter([range(first, min(first + _BATCH, num_clusters)) for first in range(0, num_clusters, _BATCH)])
+    solved = deque[Future[list[Selection]]]()
+    with _started_workers(num_workers - 1, arguments) as executor:
+
+        def hand_out() -> None:
+            under_way = sum(not batch.done() for batch in solved)
+            for batch in islice(batches, _BATCHES_AHEAD * (num_workers - 1) - under_way):
+                solved.append(executor.submit(_select_in_worker, batch))
+
+        hand_out()
+        selector = _Selector(*arguments)
+        while True:
+            own = next(batches, None) if len(solved) < _MAX_WAITING * num_workers else None
+            if own is not None:
+                solved.append(Future())
+                solved[-1].set_result(selector.select(own))
+            hand_out()
+            if not solved:
+                return
+            while solved and (own is None or solved[0].done()):
+                yield from solved.popleft().result()
+
+
+def _started_workers(count: int, arguments: tuple[Any, ...]) -> ProcessPoolExecutor:
+    """Processes that are started as they are needed."""
+    return ProcessPoolExecutor(
+        max(count, 1),
         multiprocessing.get_context("spawn"),
         initializer=_start_worker,
-        initargs=(os.getpid(), *selector.arguments),
-    ) as executor:
-        running = deque[Future[list[Selection]]]()
-        while True:
-            for batch in islice(batches, 3 * num_workers - len(running)):
-                running.append(executor.submit(_select_in_worker, batch))
-            if not running:
-                return
-            yield from running.popleft().result()
+        initargs=(os.getpid(), *arguments),
+    )

@@ -9,8 +9,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from app.cli import app
 from app.command_line import default_workspace
+from app.commands import app
 from app.config import RunConfig, option_docs
 
 ROOT = Path(__file__).parents[2]
