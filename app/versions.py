@@ -11,7 +11,7 @@ _VERSIONS = {
     "sfm": 1,
     "georegister": 1,
     "cluster": 1,
-    "select": 2,
+    "select": 3,
     "jobs": 1,
     "densify": 1,
     "fuse": 1,

@@ -63,6 +63,29 @@ def _random_program(seed: int, num_views: int) -> tuple[ViewProgram, np.ndarray]
     return program, visible
 
 
+@pytest.mark.parametrize("num_views", [5, 6, 7])
+def test_halves_of_views_are_no_solution(num_views: int) -> None:
+    """Each two views see a point that one of them must see: half of each view would do for the linear relaxation."""
+    pairs = np.array(list(itertools.combinations(range(num_views), 2)))
+    program = ViewProgram(
+        rows=CoveringRows(
+            bits=pack_rows(np.eye(num_views, dtype=bool)[pairs].any(axis=1)),
+            bounds=np.ones(len(pairs), dtype=np.int64),
+        ),
+        matches=~np.eye(num_views, dtype=bool),
+        usable=np.ones(num_views, dtype=bool),
+        fixed=np.zeros(num_views, dtype=bool),
+        n_match=2,
+        min_views=1,
+    )
+    worth = ViewQuality(quality=np.arange(1.0, num_views + 1), viewpoint=np.arange(num_views))
+    smallest = smallest_selection(program, worth.quality, 1000)
+    assert smallest.selected.sum() == smallest.size_bound == num_views - 1
+    best = best_selection(program, smallest, worth, 1000)
+    assert best.selected.tolist() == [False] + [True] * (num_views - 1)
+    assert best.quality == best.quality_bound
+
+
 @many
 @given(seeds, st.integers(3, 11))
 def test_the_solver_finds_the_optimum_of_brute_force(seed: int, num_views: int) -> None:
