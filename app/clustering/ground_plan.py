@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from app.clustering.kernels import cover_with_dots
 from app.errors import CityReconError
 
 Image = NDArray[np.uint8]
@@ -30,7 +31,7 @@ _SUBPIXELS = 1 << _SHIFT
 """OpenCV draws at this fraction of a pixel."""
 _DASH_PX, _GAP_PX = 9.0, 6.0
 _SWATCH_PX = (28, 14)
-_CHUNK_DOTS, _CHUNK_POSITIONS = 20_000, 1 << 20
+_CHUNK_POSITIONS = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -82,38 +83,12 @@ class GroundPlan:
         return shown
 
     def dots(self, positions: NDArray[np.float64], radius_px: float, color: Color, opacity: float = 1.0) -> None:
-        """Smooth round dots, to a quarter of a pixel; where several lie on each other, there is one."""
-        height, width = self.image.shape[:2]
-        side = math.floor(2 * radius_px + 1) + 1
-        phases = np.arange(4) / 4
-        starts = np.ceil(phases - radius_px - 0.5).astype(np.int64)
-        along = starts[:, None] + np.arange(side) - phases[:, None]
-        distance = np.hypot(along[:, None, :, None], along[None, :, None, :])
-        stamps = np.clip(radius_px + 0.5 - distance, 0, 1).astype(np.float32).reshape(4, 4, -1)
-        margin = 2 * side
-        stride = width + 2 * margin
-        steps = (np.arange(side)[:, None] * stride + np.arange(side)).reshape(-1)
-        cover = np.zeros((height + 2 * margin) * stride, dtype=np.float32)
-        quarters = self._distinct_quarters(positions, side) + 4 * margin
-        for start in range(0, len(quarters), _CHUNK_DOTS):
-            (x, y), (phase_x, phase_y) = np.divmod(quarters[start : start + _CHUNK_DOTS].T, 4)
-            first = (y + starts[phase_y]) * stride + x + starts[phase_x]
-            np.maximum.at(cover, first[:, None] + steps, stamps[phase_y, phase_x])
-        inner = cover.reshape(-1, stride)[margin:-margin, margin:-margin]
-        self.mix(inner * np.float32(opacity), color)
-
-    def _distinct_quarters(self, positions: NDArray[np.float64], margin: int) -> NDArray[np.int64]:
-        """Pixel coordinates of positions in or near the image, in quarters of a pixel, each once."""
-        height, width = self.image.shape[:2]
-        stride = 4 * (width + 2 * margin) + 1
-        keys = [np.empty(0, dtype=np.int64)]
+        """Smooth round dots; where several lie on each other, there is one."""
+        cover = np.zeros(self.image.shape[:2], dtype=np.float32)
         for start in range(0, len(positions), _CHUNK_POSITIONS):
-            x, y = self.to_pixels(positions[start : start + _CHUNK_POSITIONS]).T
-            near = (x > -margin) & (x < width + margin) & (y > -margin) & (y < height + margin)
-            x, y = np.round(4 * (x[near] + margin)), np.round(4 * (y[near] + margin))
-            keys.append(np.unique((y * stride + x).astype(np.int64)))
-        rows, columns = np.divmod(np.unique(np.concatenate(keys)), stride)
-        return np.stack([columns, rows], axis=1) - 4 * margin
+            pixels = self.to_pixels(positions[start : start + _CHUNK_POSITIONS])
+            cover_with_dots(cover, np.ascontiguousarray(pixels), radius_px)
+        self.mix(cover * np.float32(opacity), color)
 
     def haze(self, positions: NDArray[np.float64], color: Color, opacity: float) -> None:
         """Colour pixels by how many positions are in them; time and memory are small also for millions."""
@@ -278,7 +253,7 @@ def backing(image: Image, low_px: tuple[int, int], high_px: tuple[int, int]) -> 
     part[:] = np.round(part * 0.15 + 0.85 * 255).astype(np.uint8)
 
 
-def encode_png(image: Image, compression: int = 3) -> bytes:
+def encode_png(image: Image, compression: int = 1) -> bytes:
     """The image as PNG, compressed little and fast by default; 9 is most and slow.
 
     Raises:

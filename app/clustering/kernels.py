@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -101,3 +103,25 @@ def _sees_a_sample(
                     if sees(matrix, size_px, sample):
                         return True
     return False
+
+
+@njit(cache=True)
+def cover_with_dots(cover: NDArray[np.float32], pixels: NDArray[np.float64], radius_px: float) -> None:
+    """Raise how much of each pixel is covered, between 0 and 1, to what smooth round dots cover of it.
+
+    Args:
+        cover: (H, W) changed in place.
+        pixels: (n, 2) centres of the dots, x and y; centres of pixels are whole numbers.
+        radius_px: Where a dot covers half of a pixel; a pixel half a pixel farther away is free.
+    """
+    height, width = cover.shape
+    reach = radius_px + 0.5
+    for dot in range(len(pixels)):
+        x, y = pixels[dot, 0], pixels[dot, 1]
+        if not (-reach < x < width - 1 + reach and -reach < y < height - 1 + reach):
+            continue
+        for row in range(max(0, math.ceil(y - reach)), min(height - 1, math.floor(y + reach)) + 1):
+            for column in range(max(0, math.ceil(x - reach)), min(width - 1, math.floor(x + reach)) + 1):
+                share = min(reach - math.sqrt((column - x) ** 2 + (row - y) ** 2), 1.0)
+                if share > cover[row, column]:
+                    cover[row, column] = share

@@ -41,7 +41,7 @@ _MIN_CELL_PX = 4.0
 """Borders of smaller cells would fill the picture."""
 _GLASS = 0.55
 _NAME_PX = (125, 56)
-_COMPRESSION = 9
+_COMPRESSION = 6
 _DROPPED: Color = (226, 222, 220)
 _FILLS: tuple[Color, ...] = (
     (214, 178, 144),

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from app.clustering.ground_plan import RED, WHITE, GroundPlan, MapLabels, encode_png, legend, outline, round_length
+from app.clustering.kernels import cover_with_dots
+from tests.reference.pictures import plain_cover
 
 BLACK = (0, 0, 0)
 
@@ -52,6 +54,15 @@ def test_dots_on_each_other_are_one_and_dots_outside_are_cut_off() -> None:
     empty = _plan()
     empty.dots(np.empty((0, 2)), 2.0, RED)
     assert (empty.image == 255).all()
+
+
+@pytest.mark.parametrize("radius_px", [0.3, 1.0, 2.6])
+def test_the_kernel_for_dots_equals_its_plain_twin(radius_px: float) -> None:
+    pixels = np.random.default_rng(1).uniform([-5.0, -5.0], [45.0, 25.0], (60, 2))
+    pixels[:2] = [[np.nan, 3.0], [1e300, 5.0]]
+    cover = np.zeros((20, 40), dtype=np.float32)
+    cover_with_dots(cover, pixels, radius_px)
+    np.testing.assert_allclose(cover, plain_cover(cover.shape, pixels[2:], radius_px), atol=1e-6)
 
 
 def test_haze_counts(monkeypatch: pytest.MonkeyPatch) -> None:
