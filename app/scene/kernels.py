@@ -140,7 +140,7 @@ def decode_tracks(
     direction, mean = np.empty(3), np.empty(3)
     end = 0
     for point in range(num_points):
-        begin = end
+        begin, ascends = end, True
         for position in range(index[point] + POINT_HEADER_BYTES + 8, index[point + 1], TRACK_ELEMENT_BYTES):
             image_id = (
                 np.int64(data[position])
@@ -150,9 +150,11 @@ def decode_tracks(
             )
             row = _row_of(int(image_id), row_of_id, ascending_ids, rows)
             if row >= 0:
+                ascends = ascends and (end == begin or images[end - 1] <= row)
                 images[end] = row
                 end += 1
-        images[begin:end].sort()
+        if not ascends:
+            images[begin:end].sort()
         distinct = begin
         for element in range(begin, end):
             if element == begin or images[element] != images[distinct - 1]:

@@ -120,10 +120,16 @@ def _count_ones(word: np.uint64) -> np.int64:
 def share_at_least(bits: NDArray[np.uint64], min_shared: int) -> NDArray[np.bool_]:
     """(N, N) whether two different rows of a packed matrix (N, words) have ``min_shared`` or more bits in common."""
     out = np.zeros((len(bits), len(bits)), np.bool_)
+    words = np.empty(bits.shape[1], np.int64)
     for a in range(len(bits)):
+        num_words = 0
+        for word in range(bits.shape[1]):
+            if bits[a, word]:
+                words[num_words] = word
+                num_words += 1
         for b in range(a):
             shared = 0
-            for word in range(bits.shape[1]):
+            for word in words[:num_words]:
                 shared += int(_count_ones(bits[a, word] & bits[b, word]))
                 if shared >= min_shared:
                     out[a, b] = True
