@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from app.clustering.kernels import cover_with_dots
+from app.clustering.kernels import cover_with_dots, mix_color
 from app.errors import CityReconError
 
 Image = NDArray[np.uint8]
@@ -88,7 +88,7 @@ class GroundPlan:
         for start in range(0, len(positions), _CHUNK_POSITIONS):
             pixels = self.to_pixels(positions[start : start + _CHUNK_POSITIONS])
             cover_with_dots(cover, np.ascontiguousarray(pixels), radius_px)
-        self.mix(cover * np.float32(opacity), color)
+        self.mix(cover, color, opacity)
 
     def haze(self, positions: NDArray[np.float64], color: Color, opacity: float) -> None:
         """Colour pixels by how many positions are in them; time and memory are small also for millions."""
@@ -101,12 +101,9 @@ class GroundPlan:
             counts += np.bincount(y * width + x, minlength=len(counts))
         self.mix(1 - (1 - opacity) ** counts.reshape(height, width), color)
 
-    def mix(self, share: NDArray[np.floating], color: Color) -> None:
-        """Mix shares (H, W) of a colour into the image."""
-        painted = np.flatnonzero(share > 0)
-        alpha = share.reshape(-1)[painted, None]
-        flat = self.image.reshape(-1, 3)
-        flat[painted] = np.round(flat[painted] * (1 - alpha) + np.array(color) * alpha).astype(np.uint8)
+    def mix(self, shares: NDArray[np.floating], color: Color, opacity: float = 1.0) -> None:
+        """Mix a colour into shares (H, W) of the pixels."""
+        mix_color(self.image, shares.astype(np.float32, copy=False), opacity, color)
 
     def lines(self, ends: NDArray[np.float64], color: Color, thickness_px: int = 1) -> None:
         """Smooth lines between positions (n, 2 or more, 2)."""

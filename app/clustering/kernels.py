@@ -125,3 +125,24 @@ def cover_with_dots(cover: NDArray[np.float32], pixels: NDArray[np.float64], rad
                 share = min(reach - math.sqrt((column - x) ** 2 + (row - y) ** 2), 1.0)
                 if share > cover[row, column]:
                     cover[row, column] = share
+
+
+@njit(cache=True)
+def mix_color(
+    image: NDArray[np.uint8], shares: NDArray[np.float32], opacity: float, color: tuple[int, int, int]
+) -> None:
+    """Mix a colour into an image.
+
+    Args:
+        image: (H, W, 3) changed in place.
+        shares: (H, W) how much of each pixel is painted, between 0 and 1.
+        opacity: Of the paint, between 0 and 1.
+        color: In the image's order.
+    """
+    for row in range(shares.shape[0]):
+        for column in range(shares.shape[1]):
+            if shares[row, column] > 0.0:
+                share = opacity * shares[row, column]
+                for channel in range(3):
+                    before = image[row, column, channel]
+                    image[row, column, channel] = np.uint8(np.rint(before + share * (color[channel] - before)))

@@ -171,7 +171,7 @@ def _draw_detail(
         sheet.image[:] = 0
         sheet.boxes(corners + overlap, WHITE)
         mask = sheet.image[..., 0]
-        plan.mix(mask / 255 * _GLASS, color)
+        plan.mix(mask / 255, color, _GLASS)
         edges.append((cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)[0], _darker(color)))
         corner = _place_for_name(plan.to_pixels(corners - overlap), plan.image.shape)
         if corner is not None:

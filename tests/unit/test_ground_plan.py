@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from app.clustering.ground_plan import RED, WHITE, GroundPlan, MapLabels, encode_png, legend, outline, round_length
-from app.clustering.kernels import cover_with_dots
-from tests.reference.pictures import plain_cover
+from app.clustering.kernels import cover_with_dots, mix_color
+from tests.reference.pictures import plain_cover, plain_mix
 
 BLACK = (0, 0, 0)
 
@@ -63,6 +63,15 @@ def test_the_kernel_for_dots_equals_its_plain_twin(radius_px: float) -> None:
     cover = np.zeros((20, 40), dtype=np.float32)
     cover_with_dots(cover, pixels, radius_px)
     np.testing.assert_allclose(cover, plain_cover(cover.shape, pixels[2:], radius_px), atol=1e-6)
+
+
+def test_the_kernel_for_colours_equals_its_plain_twin() -> None:
+    rng = np.random.default_rng(2)
+    image = rng.integers(0, 256, (20, 40, 3)).astype(np.uint8)
+    shares = np.clip(rng.uniform(-0.5, 1.5, (20, 40)), 0.0, 1.0).astype(np.float32)
+    expected = plain_mix(image, shares, 0.7, RED)
+    mix_color(image, shares, 0.7, RED)
+    np.testing.assert_allclose(image, expected, atol=1)
 
 
 def test_haze_counts(monkeypatch: pytest.MonkeyPatch) -> None:
