@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import resource
+import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -44,6 +46,19 @@ class StageRun:
     def wall_s(self) -> float:
         """Of both stages."""
         return self.clustering.wall_s + self.selection.wall_s
+
+
+def median_run(runs: Sequence[StageRun]) -> StageRun:
+    """The median of each figure."""
+
+    def median(costs: list[Cost]) -> Cost:
+        return Cost(wall_s=statistics.median(c.wall_s for c in costs), cpu_s=statistics.median(c.cpu_s for c in costs))
+
+    return StageRun(
+        clustering=median([run.clustering for run in runs]),
+        selection=median([run.selection for run in runs]),
+        peak_gib=statistics.median(run.peak_gib for run in runs),
+    )
 
 
 def run_stages(model_dir: Path, output_dir: Path, method: SelectionMethod, num_workers: int) -> StageRun:
