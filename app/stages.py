@@ -146,6 +146,7 @@ def cluster_stage(run: Run) -> None:
             partial,
             options=run.config.clustering,
             labels=map_labels(run.workspace),
+            num_threads=split_cores(available_cores(), run.num_jobs)[0],
         ),
         product=lambda folder: digest_files([folder / "clusters.jsonl"]),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -62,84 +63,86 @@ class Blocks:
     """Beyond `max_camera_distance_m` of the range of the cameras: no block there could have an image."""
 
 
-def associate(scene: PosedScene, options: ClusteringOptions) -> Blocks:
+def associate(scene: PosedScene, options: ClusteringOptions, num_threads: int = 1) -> Blocks:
     """Assign keypoints and images to blocks.
 
     Args:
         scene: The posed model.
         options: With lengths in the model's units.
+        num_threads: That look for what hides blocks from images; the result doesn't depend on it.
     """
     centers = scene.centers_in_world
     grid, cells, counts, num_far = _occupied_cells(scene.points_in_world, centers, options)
-    points, cameras = PointIndex(scene.points_in_world), PointIndex(centers)
-    image_from_world, sizes_px = scene.image_from_world, scene.image_sizes_px
-    kept, dropped = [], []
-    for cell, count in zip(map(tuple, cells.tolist()), counts.tolist(), strict=True):
-        if count < options.min_keypoints_per_block:
-            dropped.append(DroppedBlock(cell=cell, num_keypoints=count, reason=DropReason.FEW_KEYPOINTS))
-            continue
-        center, size = grid.center_of(cell), np.array(options.block_size_m)
-        around = scene.points_in_world[points.rows_between(center - 1.5 * size, center + 1.5 * size)]
+    finder = _BlockFinder(scene, options, grid, centers)
+    # The rest is too quick for threads, which would wait for each other's Python.
+    with ThreadPoolExecutor(num_threads if options.visibility is BlockVisibility.OCCLUDED else 1) as threads:
+        found = list(threads.map(finder.find, map(tuple, cells.tolist()), counts.tolist()))
+    return Blocks(
+        grid=grid,
+        kept=[block for block in found if isinstance(block, Block)],
+        dropped=[block for block in found if isinstance(block, DroppedBlock)],
+        num_far_keypoints=num_far,
+    )
+
+
+class _BlockFinder:
+    """Finds the images of cells."""
+
+    def __init__(
+        self, scene: PosedScene, options: ClusteringOptions, grid: GroundGrid, centers: NDArray[np.float64]
+    ) -> None:
+        self._scene, self._options, self._grid, self._centers = scene, options, grid, centers
+        self._points, self._cameras = PointIndex(scene.points_in_world), PointIndex(centers)
+        self._image_from_world, self._sizes_px = scene.image_from_world, scene.image_sizes_px
+
+    def find(self, cell: Cell, num_keypoints: int) -> Block | DroppedBlock:
+        """The block of a cell with so many keypoints, or why there is none."""
+        options, centers = self._options, self._centers
+        if num_keypoints < options.min_keypoints_per_block:
+            return DroppedBlock(cell=cell, num_keypoints=num_keypoints, reason=DropReason.FEW_KEYPOINTS)
+        center, size = self._grid.center_of(cell), np.array(options.block_size_m)
+        around = self._scene.points_in_world[self._points.rows_between(center - 1.5 * size, center + 1.5 * size)]
         z_range = height_range(
             around[:, 2],
-            centers[cameras.rows_between(center - 1.5 * size, center + 1.5 * size), 2],
+            centers[self._cameras.rows_between(center - 1.5 * size, center + 1.5 * size), 2],
             quantiles=options.height_quantiles,
             margin=options.height_margin_m,
             camera_height=options.camera_height_m,
         )
-        box = grid.region((cell,), z_range).padded_boxes()[0]
+        box = self._grid.region((cell,), z_range).padded_boxes()[0]
         box[:, 2] = z_range
         x, y = around[:, 0], around[:, 1]
         inside = (x >= box[0, 0]) & (x <= box[1, 0]) & (y >= box[0, 1]) & (y <= box[1, 1])
         reach = options.max_camera_distance_m
-        candidates = cameras.rows_between(center - reach, center + reach)
-        candidates = candidates[np.hypot(*(centers[candidates, :2] - center).T) <= reach]
+        near = self._cameras.rows_between(center - reach, center + reach)
+        near = near[np.hypot(*(centers[near, :2] - center).T) <= reach]
         xs, ys, zs = sample_axes(box, options.sample_spacing_m)
-        with_view = cameras_with_a_view(around[inside], xs, ys, zs, image_from_world[candidates], sizes_px[candidates])
-        if options.visibility is BlockVisibility.OCCLUDED and with_view.any():
-            rows = candidates[with_view]
-            with_view[with_view] = _with_a_free_view(
-                scene,
-                points,
-                rows,
-                keypoints=around[inside],
-                samples=grid_points((xs, ys, zs)),
-                centers=centers,
-                image_from_world=image_from_world[rows],
-                sizes_px=sizes_px[rows],
-                column_m=options.sample_spacing_m,
-            )
-        if not with_view.any():
-            dropped.append(DroppedBlock(cell=cell, num_keypoints=count, reason=DropReason.NO_IMAGE))
-            continue
-        image_rows = candidates[with_view].astype(np.int32)
-        kept.append(Block(cells=(cell,), num_keypoints=count, z_range_m=z_range, image_rows=image_rows))
-    return Blocks(grid=grid, kept=kept, dropped=dropped, num_far_keypoints=num_far)
+        rows = near[cameras_with_a_view(around[inside], xs, ys, zs, self._image_from_world[near], self._sizes_px[near])]
+        if options.visibility is BlockVisibility.OCCLUDED and len(rows):
+            rows = rows[self._have_a_free_view(rows, around[inside], grid_points((xs, ys, zs)))]
+        if not len(rows):
+            return DroppedBlock(cell=cell, num_keypoints=num_keypoints, reason=DropReason.NO_IMAGE)
+        return Block(cells=(cell,), num_keypoints=num_keypoints, z_range_m=z_range, image_rows=rows.astype(np.int32))
 
-
-def _with_a_free_view(
-    scene: PosedScene,
-    points: PointIndex,
-    image_rows: NDArray[np.integer],
-    *,
-    keypoints: NDArray[np.float64],
-    samples: NDArray[np.float64],
-    centers: NDArray[np.float64],
-    image_from_world: NDArray[np.float64],
-    sizes_px: NDArray[np.float64],
-    column_m: float,
-) -> NDArray[np.bool_]:
-    """(n,) which of n images see a keypoint, or a sample outside of what is solid, that nothing solid hides.
-
-    The centres are those of all images of the scene.
-    """
-    ground = np.concatenate([samples, keypoints, centers[image_rows]])[:, :2]
-    bounds = np.stack([ground.min(axis=0), ground.max(axis=0)])
-    solid = solid_in_scene(scene, points.rows_between(*bounds), centers, bounds_m=bounds, column_m=column_m)
-    places = np.concatenate([keypoints, samples[~solid.hold(samples)]])
-    in_image = frustum_bits(np.ascontiguousarray(places.T), image_from_world, sizes_px)
-    free: NDArray[np.bool_] = np.any(solid.remove_hidden(in_image, centers[image_rows], places), axis=1)
-    return free
+    def _have_a_free_view(
+        self, image_rows: NDArray[np.integer], keypoints: NDArray[np.float64], samples: NDArray[np.float64]
+    ) -> NDArray[np.bool_]:
+        """(n,) which of n images see a keypoint, or a sample outside of what is solid, that nothing solid hides."""
+        centers = self._centers[image_rows]
+        ground = np.concatenate([samples, keypoints, centers])[:, :2]
+        bounds = np.stack([ground.min(axis=0), ground.max(axis=0)])
+        solid = solid_in_scene(
+            self._scene,
+            self._points.rows_between(*bounds),
+            self._centers,
+            bounds_m=bounds,
+            column_m=self._options.sample_spacing_m,
+        )
+        places = np.concatenate([keypoints, samples[~solid.hold(samples)]])
+        in_image = frustum_bits(
+            np.ascontiguousarray(places.T), self._image_from_world[image_rows], self._sizes_px[image_rows]
+        )
+        return solid.leave_any(in_image, centers, places)
 
 
 def _occupied_cells(

@@ -163,7 +163,7 @@ def _cluster(grid: GroundGrid, record: dict[str, Any]) -> Cluster:
     )
 
 
-def cluster_views(scene: PosedScene, options: ClusteringOptions) -> Clustering:
+def cluster_views(scene: PosedScene, options: ClusteringOptions, num_threads: int = 1) -> Clustering:
     """Cut a scene into overlapping clusters of views, [O] section 3.
 
     Needs no pairwise relation between cameras; time grows with the number of blocks times the cameras near each. The
@@ -172,13 +172,14 @@ def cluster_views(scene: PosedScene, options: ClusteringOptions) -> Clustering:
     Args:
         scene: A model with z up.
         options: Lengths in units of the model.
+        num_threads: Of the search for what hides blocks from images.
     """
-    return name_clusters(scene, find_blocks(scene, options), options)
+    return name_clusters(scene, find_blocks(scene, options, num_threads), options)
 
 
-def find_blocks(scene: PosedScene, options: ClusteringOptions) -> Blocks:
+def find_blocks(scene: PosedScene, options: ClusteringOptions, num_threads: int = 1) -> Blocks:
     """The blocks of all clusters: cells with keypoints and images, merged where they have few."""
-    blocks = associate(scene, options)
+    blocks = associate(scene, options, num_threads)
     return replace(blocks, kept=merge_small_blocks(blocks.kept, options.min_cameras_per_cluster))
 
 

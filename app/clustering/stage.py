@@ -26,7 +26,12 @@ SCENE_FOLDER = "scene"
 
 
 def cluster(
-    model_dir: Path, output_dir: Path, *, options: ClusteringOptions, labels: MapLabels | None = None
+    model_dir: Path,
+    output_dir: Path,
+    *,
+    options: ClusteringOptions,
+    labels: MapLabels | None = None,
+    num_threads: int = 1,
 ) -> Clustering:
     """Cut a model into clusters of views, [O] section 3.
 
@@ -35,13 +40,14 @@ def cluster(
         output_dir: Gets ``clusters.jsonl``, ``report.json``, ``map.png``, and the model as ``scene/`` for later stages.
         options: Lengths in units of the model.
         labels: Of the map's axes; by default metres, and y to the north.
+        num_threads: Of the search for what hides blocks from images; the result doesn't depend on it.
 
     Raises:
         InputError: the model can't be read, or no block has enough keypoints and an image near by.
     """
     store_scene(model_dir, output_dir / SCENE_FOLDER)
     scene = open_scene(output_dir / SCENE_FOLDER)
-    blocks = find_blocks(scene, options)
+    blocks = find_blocks(scene, options, num_threads)
     if not blocks.kept:
         raise InputError(
             f"no block in {model_dir} has {options.min_keypoints_per_block} keypoints and an image that sees it from"

@@ -33,40 +33,102 @@ def _enter(start: float, step: float, t: float, size: int) -> tuple[int, int, fl
 
 
 @njit(cache=True)
-def lower_to_rays(heights: NDArray[np.float64], starts: NDArray[np.float64], ends: NDArray[np.float64]) -> None:
-    """Lower each column to the lowest place where a ray passes it.
+def _start(
+    x: float, y: float, dx: float, dy: float, num_x: int, num_y: int
+) -> tuple[float, float, int, int, float, float, tuple[int, int, float, float]]:
+    """Begin the walk over the columns that a line passes.
 
-    Args:
-        heights: (X, Y) of the columns; changed in place.
-        starts: (T, 3) x and y in columns from the corner of the first one, z as in ``heights``.
-        ends: (T, 3) the same.
+    Returns:
+        Where the line enters the columns and where it leaves them (before it enters where it misses them); the first
+        column, i and j, and where the next ones begin along x and y; what `_step` needs. All along the line: 0 is its
+        start, 1 its end.
     """
-    num_x, num_y = heights.shape
-    for ray in range(len(starts)):
-        x, y, z = starts[ray]
-        dx, dy, dz = ends[ray, 0] - x, ends[ray, 1] - y, ends[ray, 2] - z
-        t, last = _clip(x, dx, num_x, 0.0, 1.0)
-        t, last = _clip(y, dy, num_y, t, last)
-        if last < t:
-            continue
-        i, way_i, next_i, gap_i = _enter(x, dx, t, num_x)
-        j, way_j, next_j, gap_j = _enter(y, dy, t, num_y)
-        while 0 <= i < num_x and 0 <= j < num_y:
-            leave = min(next_i, next_j, last)
-            heights[i, j] = min(heights[i, j], z + dz * t, z + dz * leave)
-            if leave >= last:
-                break
-            t = leave
-            if next_i < next_j:
-                i += way_i
-                next_i += gap_i
-            else:
-                j += way_j
-                next_j += gap_j
+    enter, last = _clip(x, dx, num_x, 0.0, 1.0)
+    enter, last = _clip(y, dy, num_y, enter, last)
+    i, way_i, next_i, gap_i = _enter(x, dx, enter, num_x)
+    j, way_j, next_j, gap_j = _enter(y, dy, enter, num_y)
+    return enter, last, i, j, next_i, next_j, (way_i, way_j, gap_i, gap_j)
 
 
 @njit(cache=True)
-def clear_blocked(
+def _step(
+    i: int, j: int, next_i: float, next_j: float, steps: tuple[int, int, float, float]
+) -> tuple[int, int, float, float]:
+    """The next column, and where those after it begin."""
+    way_i, way_j, gap_i, gap_j = steps
+    if next_i < next_j:
+        return i + way_i, j, next_i + gap_i, next_j
+    return i, j + way_j, next_i, next_j + gap_j
+
+
+@njit(cache=True, nogil=True)
+def lower_to_rays(
+    heights: NDArray[np.float64],
+    centers: NDArray[np.float64],
+    points: NDArray[np.float64],
+    ray_centers: NDArray[np.integer],
+    ray_points: NDArray[np.integer],
+    corner_m: NDArray[np.float64],
+    column_m: float,
+    gap_m: float,
+) -> None:
+    """Lower each column to the lowest place where a ray passes it.
+
+    Args:
+        heights: (X, Y) of the columns in metres; changed in place.
+        centers: (N, 3) of cameras, in the world.
+        points: (P, 3) in the world.
+        ray_centers: (T,) rows of the centres where rays start.
+        ray_points: (T,) rows of the points where they end.
+        corner_m: (2,) lowest x and y of the first column.
+        column_m: Side of a column.
+        gap_m: How far before its point a ray ends.
+    """
+    num_x, num_y = heights.shape
+    for ray in range(len(ray_points)):
+        center, point = centers[ray_centers[ray]], points[ray_points[ray]]
+        dx, dy, dz = point[0] - center[0], point[1] - center[1], point[2] - center[2]
+        length_m = np.sqrt(dx * dx + dy * dy + dz * dz)
+        if length_m <= gap_m:
+            continue
+        part = 1.0 - gap_m / length_m
+        x, y, z = (center[0] - corner_m[0]) / column_m, (center[1] - corner_m[1]) / column_m, center[2]
+        dx, dy, dz = part * dx / column_m, part * dy / column_m, part * dz
+        enter, last, i, j, next_i, next_j, steps = _start(x, y, dx, dy, num_x, num_y)
+        while enter <= last and 0 <= i < num_x and 0 <= j < num_y:
+            leave = min(next_i, next_j, last)
+            heights[i, j] = min(heights[i, j], z + dz * enter, z + dz * leave)
+            if leave >= last:
+                break
+            enter = leave
+            i, j, next_i, next_j = _step(i, j, next_i, next_j, steps)
+
+
+@njit(cache=True)
+def _is_hidden(
+    tops: NDArray[np.float64], center: NDArray[np.float64], point: NDArray[np.float64], max_solid: float
+) -> bool:
+    """Whether the straight line between a camera and a point runs too far through solid columns; see below."""
+    num_x, num_y = tops.shape
+    x, y, z = center
+    dx, dy, dz = point[0] - x, point[1] - y, point[2] - z
+    allowed = max_solid / max(np.sqrt(dx * dx + dy * dy), 1e-9)
+    enter, last, i, j, next_i, next_j, steps = _start(x, y, dx, dy, num_x, num_y)
+    while enter <= last and 0 <= i < num_x and 0 <= j < num_y:
+        leave = min(next_i, next_j, last)
+        if z + dz * 0.5 * (enter + leave) < tops[i, j]:
+            allowed -= leave - enter
+            if allowed < 0.0:
+                return True
+        if leave >= last:
+            break
+        enter = leave
+        i, j, next_i, next_j = _step(i, j, next_i, next_j, steps)
+    return False
+
+
+@njit(cache=True, nogil=True)
+def clear_hidden(
     seen: NDArray[np.uint64],
     tops: NDArray[np.float64],
     centers: NDArray[np.float64],
@@ -83,34 +145,27 @@ def clear_blocked(
         points: (P, 3) the same.
         max_solid: Length in columns, on the ground, of what may be solid along the line.
     """
-    num_x, num_y = tops.shape
     for camera in range(len(centers)):
-        x, y, z = centers[camera]
         for point in range(len(points)):
             bit = np.uint64(1) << np.uint64(point % 64)
-            if not seen[camera, point // 64] & bit:
-                continue
-            dx, dy, dz = points[point, 0] - x, points[point, 1] - y, points[point, 2] - z
-            t, last = _clip(x, dx, num_x, 0.0, 1.0)
-            t, last = _clip(y, dy, num_y, t, last)
-            if last < t:
-                continue
-            i, way_i, next_i, gap_i = _enter(x, dx, t, num_x)
-            j, way_j, next_j, gap_j = _enter(y, dy, t, num_y)
-            allowed = max_solid / max(np.sqrt(dx * dx + dy * dy), 1e-9)
-            while 0 <= i < num_x and 0 <= j < num_y:
-                leave = min(next_i, next_j, last)
-                if z + dz * 0.5 * (t + leave) < tops[i, j]:
-                    allowed -= leave - t
-                    if allowed < 0.0:
-                        seen[camera, point // 64] &= ~bit
-                        break
-                if leave >= last:
-                    break
-                t = leave
-                if next_i < next_j:
-                    i += way_i
-                    next_i += gap_i
-                else:
-                    j += way_j
-                    next_j += gap_j
+            if seen[camera, point // 64] & bit and _is_hidden(tops, centers[camera], points[point], max_solid):
+                seen[camera, point // 64] &= ~bit
+
+
+@njit(cache=True, nogil=True)
+def see_any(
+    seen: NDArray[np.uint64],
+    tops: NDArray[np.float64],
+    centers: NDArray[np.float64],
+    points: NDArray[np.float64],
+    max_solid: float,
+) -> NDArray[np.bool_]:
+    """(N,) which cameras `clear_hidden` would leave a point; each is asked only until one is found."""
+    out = np.zeros(len(centers), np.bool_)
+    for camera in range(len(centers)):
+        for point in range(len(points)):
+            bit = np.uint64(1) << np.uint64(point % 64)
+            if seen[camera, point // 64] & bit and not _is_hidden(tops, centers[camera], points[point], max_solid):
+                out[camera] = True
+                break
+    return out

@@ -22,7 +22,8 @@ def _input(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _solid(points: np.ndarray, rows: np.ndarray, centers: np.ndarray) -> SolidColumns:
-    return solid_columns(points, rows, centers, bounds_m=BOUNDS_M, column_m=1.3)
+    rays = np.arange(len(rows))
+    return solid_columns(points, centers, ray_points=rows, ray_centers=rays, bounds_m=BOUNDS_M, column_m=1.3)
 
 
 def _left(solid: SolidColumns, cameras: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -62,3 +63,4 @@ def test_only_points_that_were_in_the_image_are_seen(seed: int) -> None:
     seen = np.random.default_rng(seed).integers(0, 2**60, (len(cameras), 1), dtype=np.uint64)
     left = solid.remove_hidden(seen, cameras, points)
     assert not np.any(left & ~seen)
+    np.testing.assert_array_equal(solid.leave_any(seen, cameras, points), np.any(left, axis=1))

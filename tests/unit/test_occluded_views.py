@@ -41,6 +41,13 @@ def test_only_images_that_see_a_block_past_the_houses_join_it(scene: PosedScene)
     assert [len(block.image_names) for block in by_sight] == [15, 15]
 
 
+def test_clusters_do_not_depend_on_the_number_of_threads(scene: PosedScene) -> None:
+    options = replace(OPTIONS, block_size_m=(3.0, 4.0), min_cameras_per_cluster=1, visibility=BlockVisibility.OCCLUDED)
+    one, four = (cluster_views(scene, options, num_threads) for num_threads in (1, 4))
+    assert one == four
+    assert len({cluster.image_names for cluster in one.clusters}) > 10
+
+
 def test_selection_takes_no_image_from_behind_the_houses(scene: PosedScene) -> None:
     here, _ = blocks(scene, BlockVisibility.FRUSTUM)
     options = SelectionOptions(visibility=Visibility.OCCLUDED, n_low=4)

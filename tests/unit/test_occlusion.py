@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.occlusion.kernels import clear_blocked, lower_to_rays
+from app.occlusion.kernels import clear_hidden, lower_to_rays, see_any
 from app.occlusion.solid_columns import SolidColumns, solid_columns
 from tests.reference import occlusion as plain
 from tests.reference.two_streets import OTHER_STREET, STREET, cameras, facade
@@ -25,7 +25,7 @@ BOUNDS_M = np.array([[0.0, 0.0], [30.0, 24.0]])
 def observed(
     walls: list[tuple[np.ndarray, np.ndarray]], radius_m: float = 15.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points, and rays from each camera to all points of its wall within the radius."""
+    """Points, and rays from each camera to all points of its wall within the radius: row of the point, and centre."""
     points = np.concatenate([wall for wall, _ in walls])
     rows, centers, first = [], [], 0
     for wall, views in walls:
@@ -37,6 +37,12 @@ def observed(
     return points, np.concatenate(rows), np.concatenate(centers)
 
 
+def solid_of(points: np.ndarray, rows: np.ndarray, centers: np.ndarray) -> SolidColumns:
+    """What is solid in the rectangle, by rays with a centre each."""
+    rays = np.arange(len(rows))
+    return solid_columns(points, centers, ray_points=rows, ray_centers=rays, bounds_m=BOUNDS_M, column_m=1.0)
+
+
 def is_seen(solid: SolidColumns, camera: list[float], point: list[float]) -> bool:
     left = solid.remove_hidden(np.ones((1, 1), np.uint64), np.array([camera]), np.array([point]))
     return bool(left[0, 0])
@@ -45,7 +51,7 @@ def is_seen(solid: SolidColumns, camera: list[float], point: list[float]) -> boo
 @pytest.fixture(scope="module")
 def houses() -> SolidColumns:
     walls = [(facade(8.0), cameras(STREET)), (facade(16.0), cameras(OTHER_STREET))]
-    return solid_columns(*observed(walls), bounds_m=BOUNDS_M, column_m=1.0)
+    return solid_of(*observed(walls))
 
 
 def test_a_row_of_houses_hides_the_other_street(houses: SolidColumns) -> None:
@@ -77,7 +83,7 @@ def test_a_plain_wall_closes_between_its_windows() -> None:
     """Keypoints only around windows 3 m apart, as on a wall without texture; no ray passes between them."""
     wall = facade(8.0)
     wall = wall[(wall[:, 0] % 3.0 < 0.9) & (wall[:, 2] > 1.0)]
-    solid = solid_columns(*observed([(wall, cameras(STREET))]), bounds_m=BOUNDS_M, column_m=1.0)
+    solid = solid_of(*observed([(wall, cameras(STREET))]))
     hidden = [not is_seen(solid, [x, STREET, 1.7], [x, 15.0, 2.0]) for x in np.arange(3.0, 27.0, 0.5)]
     assert all(hidden)
 
@@ -87,13 +93,13 @@ def test_points_with_an_error_open_nothing_behind_their_wall() -> None:
     wall = facade(7.9)
     wall[:, 1] += np.random.default_rng(1).uniform(0, 0.3, len(wall))
     from_the_front = observed([(wall, cameras(STREET))], radius_m=4.8)
-    solid = solid_columns(*from_the_front, bounds_m=BOUNDS_M, column_m=1.0)
+    solid = solid_of(*from_the_front)
     assert solid.hold(np.array([[x, 8.5, 1.0] for x in np.arange(3.5, 27.0)])).all()
 
 
 def test_a_road_without_keypoints_is_free_below_the_rays() -> None:
     wall = facade(8.0)
-    solid = solid_columns(*observed([(wall[wall[:, 2] > 2], cameras(STREET))]), bounds_m=BOUNDS_M, column_m=1.0)
+    solid = solid_of(*observed([(wall[wall[:, 2] > 2], cameras(STREET))]))
     assert is_seen(solid, [2.0, STREET, 1.7], [20.0, 7.5, 1.0])
 
 
@@ -104,19 +110,17 @@ def test_a_gap_between_houses_that_is_looked_through_is_open() -> None:
     behind = np.array([[15.0, 22.0, 0.5], [15.2, 22.0, 4.0]])
     camera = np.array([[15.0, STREET, 1.7]])
     points, rows, centers = observed([(front, cameras(STREET)), (behind, np.empty((0, 3)))])
-    without = solid_columns(points, rows, centers, bounds_m=BOUNDS_M, column_m=1.0)
+    without = solid_of(points, rows, centers)
     rows = np.append(rows, [len(front), len(front) + 1])
     centers = np.concatenate([centers, camera, camera])
-    through = solid_columns(points, rows, centers, bounds_m=BOUNDS_M, column_m=1.0)
+    through = solid_of(points, rows, centers)
     assert not is_seen(without, [15.0, STREET, 1.7], [15.0, 18.0, 1.5])
     assert is_seen(through, [15.0, STREET, 1.7], [15.0, 18.0, 1.5])
     assert not is_seen(through, [10.0, STREET, 1.7], [10.0, 18.0, 1.5])
 
 
 def test_nothing_hides_where_there_are_no_points_near_by() -> None:
-    solid = solid_columns(
-        np.array([[2.0, 2.0, 9.0]]), np.array([0]), np.array([[1.0, 1.0, 1.7]]), bounds_m=BOUNDS_M, column_m=1.0
-    )
+    solid = solid_of(np.array([[2.0, 2.0, 9.0]]), np.array([0]), np.array([[1.0, 1.0, 1.7]]))
     assert is_seen(solid, [29.0, 1.0, 1.7], [29.0, 23.0, 1.7])
 
 
@@ -132,14 +136,22 @@ def test_the_walks_agree_with_their_plain_twins() -> None:
     ends[10] = starts[10] + (0, 0, 3)
     heights = rng.uniform(0, 30, (9, 7))
     lowered = heights.copy()
-    lower_to_rays(lowered, starts, ends)
-    np.testing.assert_allclose(lowered, plain.lower_to_rays(heights, starts, ends), rtol=0, atol=1e-9)
+    corner_m, column_m, gap_m = np.array([-2.0, 5.0]), 0.5, 0.7
+    scale, shift = [column_m, column_m, 1.0], [*corner_m, 0.0]
+    rays = np.arange(40)
+    lower_to_rays(lowered, starts * scale + shift, ends * scale + shift, rays, rays, corner_m, column_m, gap_m)
+    lengths_m = np.linalg.norm((ends - starts) * scale, axis=1, keepdims=True)
+    cut = starts + np.maximum(1 - gap_m / lengths_m, 0) * (ends - starts)
+    np.testing.assert_allclose(lowered, plain.lower_to_rays(heights, starts, cut), rtol=0, atol=1e-9)
     assert (lowered < heights).sum() > 20
 
     tops = rng.uniform(-2, 12, (9, 7))
     solid = np.array([[plain.solid_length(tops, start, end) for end in ends] for start in starts])
     seen = np.full((40, 1), (1 << 40) - 1, np.uint64)
-    clear_blocked(seen, tops, starts, ends, 2.5)
+    np.testing.assert_array_equal(see_any(seen, tops, starts, ends, 2.5), (solid <= 2.5).any(axis=1))
+    few = seen & np.uint64(0b1011)
+    np.testing.assert_array_equal(see_any(few, tops, starts, ends, 2.5), (solid <= 2.5)[:, [0, 1, 3]].any(axis=1))
+    clear_hidden(seen, tops, starts, ends, 2.5)
     bits = (seen >> np.arange(40, dtype=np.uint64)) & np.uint64(1)
     np.testing.assert_array_equal(bits.astype(bool), solid <= 2.5)
     assert 200 < bits.sum() < 1400
@@ -148,3 +160,5 @@ def test_the_walks_agree_with_their_plain_twins() -> None:
 def test_bits_that_do_not_fit_are_refused(houses: SolidColumns) -> None:
     with pytest.raises(ValueError, match="2 cameras and 3 points"):
         houses.remove_hidden(np.ones((3, 1), np.uint64), np.zeros((2, 3)), np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="2 cameras and 3 points"):
+        houses.leave_any(np.ones((3, 1), np.uint64), np.zeros((2, 3)), np.zeros((3, 3)))
