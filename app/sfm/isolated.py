@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import logging
 import multiprocessing
 import os
@@ -14,6 +13,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeVar
 
+from app.child_process import die_with_parent
 from app.errors import CityReconError, DiskFullError
 from app.workspace import is_disk_full
 
@@ -21,7 +21,6 @@ logger = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
 Progress = Callable[[int, int], None]
-_PR_SET_PDEATHSIG = 1
 _SHOWN_LINES = 3
 
 
@@ -89,7 +88,7 @@ class _Forward(logging.Handler):
 def _serve(
     sender: Connection, parent: int, log_file: Path, function: Callable[..., object], arguments: tuple[Any, ...]
 ) -> None:
-    _die_with(parent)
+    die_with_parent(parent)
     log_file.parent.mkdir(parents=True, exist_ok=True)
     log = os.open(log_file, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
     os.dup2(log, sys.stderr.fileno() if sys.stderr is not None else 2)
@@ -102,16 +101,8 @@ def _serve(
         sender.send(("result", function(*arguments, lambda done, total: sender.send(("progress", (done, total))))))
     except CityReconError as error:
         sender.send(("error", error))
-    except BaseException:
+    except Exception:
         sender.send(("traceback", traceback.format_exc()))
-
-
-def _die_with(parent: int) -> None:
-    """Have the kernel end this process when its parent ends."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:
-            os._exit(1)
 
 
 def _exit_text(exitcode: int | None) -> str:
