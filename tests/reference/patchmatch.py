@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 MASK = 2**64 - 1
+WINDOW = np.array([(x, y) for y in range(-5, 6, 2) for x in range(-5, 6, 2) if abs(x) + abs(y) < 10])
+"""(32, 2) x, y: every second pixel of 11 x 11, without the corners."""
 
 
 @dataclass
@@ -22,18 +25,18 @@ class Camera:
     grey: NDArray[np.uint8]
 
 
-def point_on_plane(camera: Camera, x: float, y: float, plane: Array, at: tuple[float, float]) -> Array:
-    """World point where the ray of pixel (x, y) meets the plane (w, a, b) of pixel `at`."""
+def point_on_plane(camera: Camera, x: Any, y: Any, plane: Array, at: tuple[float, float]) -> Array:
+    """(..., 3) world points where the rays of pixels (x, y) meet the plane (w, a, b) of pixel `at`."""
     depth = 1 / (plane[0] + plane[1] * (x - at[0]) + plane[2] * (y - at[1]))
-    in_camera = np.linalg.inv(camera.calibration) @ [x, y, 1.0] * depth
-    return camera.pose[:, :3].T @ (in_camera - camera.pose[:, 3])
+    rays = np.stack([x, y, np.ones_like(depth)], axis=-1) @ np.linalg.inv(camera.calibration).T
+    return (rays * np.asarray(depth)[..., None] - camera.pose[:, 3]) @ camera.pose[:, :3]
 
 
-def project(camera: Camera, point: Array) -> tuple[float, float, float]:
-    """Pixel and depth of a world point."""
-    in_camera = camera.pose[:, :3] @ point + camera.pose[:, 3]
-    pixel = camera.calibration @ in_camera
-    return pixel[0] / pixel[2], pixel[1] / pixel[2], in_camera[2]
+def project(camera: Camera, point: Array) -> tuple[Any, Any, Any]:
+    """Pixels and depths of (..., 3) world points."""
+    in_camera = point @ camera.pose[:, :3].T + camera.pose[:, 3]
+    pixel = in_camera @ camera.calibration.T
+    return pixel[..., 0] / pixel[..., 2], pixel[..., 1] / pixel[..., 2], in_camera[..., 2]
 
 
 def normal_of(camera: Camera, x: float, y: float, plane: Array) -> Array:
@@ -47,47 +50,65 @@ def normal_of(camera: Camera, x: float, y: float, plane: Array) -> Array:
     return -normal if normal @ first > 0 else normal
 
 
-def interpolate(grey: NDArray[np.uint8], x: float, y: float) -> float:
-    """Bilinear grey value."""
-    x0, y0 = int(x), int(y)
+def packed_neighbours(grey: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    """(H * W,) each pixel, the one on its right and the two below, from the lowest byte up; borders repeat."""
+    padded = np.pad(grey, ((0, 1), (0, 1)), mode="edge").astype(np.uint32)
+    return (padded[:-1, :-1] + (padded[:-1, 1:] << 8) + (padded[1:, :-1] << 16) + (padded[1:, 1:] << 24)).ravel()
+
+
+def interpolate(grey: NDArray[np.uint8], x: Array, y: Array) -> Array:
+    """Bilinear grey values."""
+    x0, y0 = x.astype(int), y.astype(int)
     fx, fy = x - x0, y - y0
-    g = grey[y0 : y0 + 2, x0 : x0 + 2].astype(np.float64)
-    return float((g[0, 0] * (1 - fx) + g[0, 1] * fx) * (1 - fy) + (g[1, 0] * (1 - fx) + g[1, 1] * fx) * fy)
+    g = grey.astype(np.float64)
+    above = g[y0, x0] * (1 - fx) + g[y0, x0 + 1] * fx
+    below = g[y0 + 1, x0] * (1 - fx) + g[y0 + 1, x0 + 1] * fx
+    return above * (1 - fy) + below * fy
 
 
-def window_offsets() -> list[tuple[int, int]]:
-    """Every second pixel of 11 x 11, without the corners."""
-    return [(x, y) for y in range(-5, 6, 2) for x in range(-5, 6, 2) if abs(x) + abs(y) < 10]
+def patch_weights(grey: NDArray[np.uint8], x: int, y: int, sigmas: tuple[float, float]) -> Array:
+    """(32,) normalised bilateral weights of the window by distance and grey value; 0 outside the image."""
+    columns, rows = np.array([x, y])[:, None] + WINDOW.T
+    inside = (columns >= 0) & (columns < grey.shape[1]) & (rows >= 0) & (rows < grey.shape[0])
+    near = np.exp(-np.sum(WINDOW**2, axis=1) / (2 * sigmas[0] ** 2))
+    alike = np.exp(-((patch_values(grey, x, y) - grey[y, x]) ** 2) / (2 * sigmas[1] ** 2))
+    weights = np.where(inside, near * np.maximum(alike, 1e-9), 0.0)
+    return weights / weights.sum()
 
 
-def patch_weights(grey: NDArray[np.uint8], x: int, y: int, sigma_space: float, sigma_grey: float) -> Array:
-    """Normalised bilateral weights of the window; 0 outside the image."""
-    weights = []
-    for dx, dy in window_offsets():
-        if not (0 <= x + dx < grey.shape[1] and 0 <= y + dy < grey.shape[0]):
-            weights.append(0.0)
-            continue
-        step = float(grey[y + dy, x + dx]) - float(grey[y, x])
-        alike = max(math.exp(-(step**2) / (2 * sigma_grey**2)), 1e-9)
-        weights.append(math.exp(-(dx * dx + dy * dy) / (2 * sigma_space**2)) * alike)
-    return np.array(weights) / sum(weights)
+def patch_values(grey: NDArray[np.uint8], x: int, y: int) -> Array:
+    """(32,) grey values of the window; anything outside the image."""
+    columns, rows = np.clip(WINDOW + [x, y], 0, [grey.shape[1] - 1, grey.shape[0] - 1]).T
+    return grey[rows, columns].astype(np.float64)
 
 
-def patch_cost(
-    reference: Camera, source: Camera, x: int, y: int, plane: Array, sigma_space: float, sigma_grey: float
-) -> float:
-    """1 - bilateral NCC of a patch that lies wholly in the source image."""
-    weights = patch_weights(reference.grey, x, y, sigma_space, sigma_grey)
-    ours, theirs = [], []
-    for (dx, dy), weight in zip(window_offsets(), weights, strict=True):
-        ours.append(float(reference.grey[y + dy, x + dx]) if weight > 0 else 0.0)
-        point = point_on_plane(reference, x + dx, y + dy, plane, (x, y))
-        u, v, _ = project(source, point)
-        height, width = source.grey.shape
-        theirs.append(interpolate(source.grey, min(max(u, 0), width - 1.01), min(max(v, 0), height - 1.01)))
-    a, b = np.array(ours) - weights @ ours, np.array(theirs) - weights @ theirs
+def patch_variance(grey: NDArray[np.uint8], x: int, y: int, sigmas: tuple[float, float]) -> float:
+    """Weighted variance of the window's grey values."""
+    weights, values = patch_weights(grey, x, y, sigmas), patch_values(grey, x, y)
+    return float(weights @ (values - weights @ values) ** 2)
+
+
+def patch_cost(reference: Camera, source: Camera, x: int, y: int, plane: Array, sigmas: tuple[float, float]) -> float:
+    """1 - bilateral NCC; 2 where the patch reaches behind the source view or out of its image, or is bare there."""
+    step = 1e-4
+    corners = np.array([(-7, -7), (-7, 7), (7, -7), (7, 7)])
+    steps = step * np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)])
+    dx, dy = np.concatenate([WINDOW, corners, steps]).T
+    u, v, depth = project(source, point_on_plane(reference, x + dx, y + dy, plane, (x, y)))
+    if np.any((depth * (plane[0] + plane[1] * dx + plane[2] * dy))[32:36] <= 0):
+        return 2.0
+    limits = np.array([source.grey.shape[1], source.grey.shape[0]]) - 1.01
+    middle, left, right, above, below = np.stack([u, v], axis=1)[36:]
+    reach = 3 * (np.abs(right - left) + np.abs(below - above)) / (2 * step)
+    if np.any((middle < reach) | (middle > limits - reach)):
+        return 2.0
+    theirs = interpolate(source.grey, np.clip(u[:32], 0, limits[0]), np.clip(v[:32], 0, limits[1]))
+    weights, ours = patch_weights(reference.grey, x, y, sigmas), patch_values(reference.grey, x, y)
+    a, b = ours - weights @ ours, theirs - weights @ theirs
+    if weights @ (b * b) < 0.5:
+        return 2.0
     ncc = (weights @ (a * b)) / math.sqrt((weights @ (a * a)) * (weights @ (b * b)))
-    return min(max(1 - ncc, 0.0), 2.0)
+    return float(min(max(1 - ncc, 0.0), 2.0))
 
 
 def reprojection_error(
@@ -220,14 +241,14 @@ def px_per_inverse_depth(reference: Camera, source: Camera, x: int, y: int, w: f
 
 
 def num_confirming(
-    reference: Camera, sources: list[Camera], maps: Array, x: int, y: int, plane: Array, max_cost: float, sigmas: Array
+    reference: Camera, sources: list[Camera], maps: Array, x: int, y: int, plane: Array, max_cost: float, sigmas: Any
 ) -> int:
     """Source views where the patch matches, matches nowhere within 2 pixels, and whose own map agrees to a pixel."""
     count = 0
     for source, its_map in zip(sources, maps, strict=True):
         step = np.array([2 / px_per_inverse_depth(reference, source, x, y, plane[0]), 0, 0])
         cost, *others = (
-            patch_cost(reference, source, x, y, plane + shift, *sigmas) for shift in (0 * step, step, -step)
+            patch_cost(reference, source, x, y, plane + shift, sigmas) for shift in (0 * step, step, -step)
         )
         near = reprojection_error(reference, source, its_map, x, y, plane[0], 2.0) <= 0.5
         count += near and cost <= max_cost and min(others) > cost + 0.1

@@ -2,128 +2,56 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 
 from mvs_backends.patchmatch import kernels as search
 from mvs_backends.patchmatch.cost import kernels as cost
-from mvs_backends.patchmatch.geometry import LevelCamera, depth_and_normal, warp
+from mvs_backends.patchmatch.geometry import depth_and_normal
 from mvs_backends.patchmatch.maps.kernels import credible_rows, smooth_rows, upsample
-from mvs_backends.patchmatch.options import PatchMatchOptions
-from mvs_backends.patchmatch.search import window
 from tests.reference import patchmatch as plain
-
-WIDTH, HEIGHT, NUM_SOURCES = 40, 32, 3
-OPTIONS = PatchMatchOptions()
-WINDOW = window(OPTIONS)
-
-
-@dataclass
-class Scene:
-    reference: plain.Camera
-    sources: list[plain.Camera]
-    maps: np.ndarray
-    kernel_reference: cost.Reference
-    kernel_sources: cost.Sources
-
-
-def grey_image(rng: np.random.Generator) -> np.ndarray:
-    coarse = rng.uniform(60, 190, (HEIGHT // 4 + 2, WIDTH // 4 + 2))
-    fine = np.kron(coarse, np.ones((4, 4)))[:HEIGHT, :WIDTH] + rng.uniform(-12, 12, (HEIGHT, WIDTH))
-    return fine.astype(np.uint8)
-
-
-def planes_near(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Random planes about 5 away, mildly slanted."""
-    w = 1 / rng.uniform(4.5, 5.5, shape)
-    slopes = rng.uniform(-0.003, 0.003, (*shape, 2))
-    return np.concatenate([w[..., None], slopes], axis=-1).astype(np.float32)
-
-
-def scene(seed: int, *, reach: float = 0.4, num_alike: int = 0) -> Scene:
-    """A reference and sources up to `reach` beside it; the first `num_alike` of them show the same image.
-
-    Its left half is a smooth shade then.
-    """
-    rng = np.random.default_rng(seed)
-    calibration = np.array([[45.0, 0, WIDTH / 2], [0, 44.0, HEIGHT / 2], [0, 0, 1]])
-    cameras = []
-    for i in range(NUM_SOURCES + 1):
-        angles = rng.uniform(-0.03, 0.03, 3)
-        turn = np.array([[0, -angles[2], angles[1]], [angles[2], 0, -angles[0]], [-angles[1], angles[0], 0]])
-        rotation, _ = np.linalg.qr(np.eye(3) + turn)
-        rotation *= np.sign(np.diag(rotation))
-        shift = rng.uniform(-reach, reach, 3) if i else np.zeros(3)
-        pose = np.concatenate([rotation, shift[:, None]], axis=1)
-        grey = cameras[0].grey if 0 < i <= num_alike else grey_image(rng)
-        if i == 0 and num_alike:
-            grey[:, : WIDTH // 2] = 60 + 5 * np.arange(WIDTH // 2)
-        cameras.append(plain.Camera(calibration=calibration, pose=pose, grey=grey))
-    levels = [LevelCamera(width=WIDTH, height=HEIGHT, calibration=calibration, cam_from_world=c.pose) for c in cameras]
-    maps = planes_near(rng, (NUM_SOURCES, HEIGHT, WIDTH))
-    maps[rng.random(maps.shape[:3]) < 0.1] = 0
-    packed = np.empty((NUM_SOURCES, HEIGHT * WIDTH), np.uint32)
-    for camera, out in zip(cameras[1:], packed, strict=True):
-        cost.pack_neighbours(camera.grey, out)
-    to_source = np.stack([warp(level, levels[0]) for level in levels[1:]])
-    pose = cameras[0].pose
-    centers = [pose[:, :3] @ level.center_in_world + pose[:, 3] for level in levels[1:]]
-    size = WIDTH * HEIGHT
-    sources = cost.Sources(
-        warp=to_source,
-        centers=np.array(centers, np.float32),
-        texels=packed.ravel(),
-        first=np.arange(NUM_SOURCES).astype(np.uint64) * np.uint64(size),
-        width=np.full(NUM_SOURCES, WIDTH, np.int32),
-        limit=np.tile(np.array([WIDTH - 1.01, HEIGHT - 1.01], np.float32), (NUM_SOURCES, 1)),
-        planes=maps.reshape(-1, 3),
-        plane_first=np.arange(NUM_SOURCES).astype(np.uint64) * np.uint64(size),
-        plane_size=np.tile(np.array([WIDTH, HEIGHT], np.int32), (NUM_SOURCES, 1)),
-        to_map=to_source,
-        from_map=np.stack([warp(levels[0], level) for level in levels[1:]]),
-    )
-    reference = cost.Reference(
-        padded_grey=np.pad(cameras[0].grey, cost.PADDING, mode="edge"),
-        inverse_range=np.tile(np.array([0.15, 0.3], np.float32), (HEIGHT, WIDTH, 1)),
-        intrinsics=np.array([45.0, 44.0, WIDTH / 2, HEIGHT / 2], np.float32),
-    )
-    return Scene(cameras[0], cameras[1:], maps, reference, sources)
+from tests.reference.stereo_scene import (
+    HEIGHT,
+    NUM_SOURCES,
+    SIGMAS,
+    WIDTH,
+    WINDOW,
+    grey_image,
+    planes_near,
+    scene,
+    wall_scene,
+)
 
 
 def test_packed_neighbours_are_the_four_pixels() -> None:
     grey = grey_image(np.random.default_rng(0))
     packed = np.empty(grey.size, np.uint32)
     cost.pack_neighbours(grey, packed)
-    padded = np.pad(grey, ((0, 1), (0, 1)), mode="edge")
-    parts = packed.reshape(HEIGHT, WIDTH, 1).view(np.uint8).reshape(HEIGHT, WIDTH, 4)
-    expected = np.stack([padded[:-1, :-1], padded[:-1, 1:], padded[1:, :-1], padded[1:, 1:]], axis=-1)
-    np.testing.assert_array_equal(parts, expected)
+    np.testing.assert_array_equal(packed, plain.packed_neighbours(grey))
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_patch_cost(seed: int) -> None:
-    made = scene(seed)
+    made, wall = wall_scene(seed)
     rng = np.random.default_rng(seed + 100)
     scratch = cost.new_scratch(NUM_SOURCES)
-    compared = 0
-    for _ in range(60):
+    found, expected = [], []
+    for _ in range(100):
         x, y = int(rng.integers(0, WIDTH)), int(rng.integers(0, HEIGHT))
-        plane = planes_near(rng, ())
+        nearer = rng.choice([1, 1.02, rng.uniform(-1, 30)])
+        plane = (wall[y, x] * nearer + rng.normal(0, [0, 1e-3, 1e-3])).astype(np.float32)
         grey = made.kernel_reference.padded_grey
         variance = cost.sample_reference(grey, x, y, WINDOW, scratch.weight, scratch.centred)
-        weights = plain.patch_weights(made.reference.grey, x, y, OPTIONS.sigma_space_px, OPTIONS.sigma_grey)
-        np.testing.assert_allclose(scratch.weight, weights, rtol=2e-4, atol=1e-7)
+        assert variance == pytest.approx(plain.patch_variance(made.reference.grey, x, y, SIGMAS), rel=1e-3, abs=1e-2)
+        np.testing.assert_allclose(
+            scratch.weight, plain.patch_weights(made.reference.grey, x, y, SIGMAS), rtol=2e-4, atol=1e-7
+        )
+        if variance < cost.MIN_VARIANCE:
+            continue
         for j, source in enumerate(made.sources):
-            found = cost.view_cost(j, x, y, *plane, np.float32(variance), made.kernel_sources, WINDOW, scratch)
-            if found == cost.MAX_COST:
-                continue
-            sigmas = OPTIONS.sigma_space_px, OPTIONS.sigma_grey
-            expected = plain.patch_cost(made.reference, source, x, y, plane.astype(np.float64), *sigmas)
-            assert found == pytest.approx(expected, abs=5e-3)
-            compared += 1
-    assert compared > 60
+            found.append(cost.view_cost(j, x, y, *plane, np.float32(variance), made.kernel_sources, WINDOW, scratch))
+            expected.append(plain.patch_cost(made.reference, source, x, y, plane.astype(np.float64), SIGMAS))
+    np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
 def test_patch_beside_the_source_image_has_the_largest_cost() -> None:
@@ -183,26 +111,26 @@ def test_smoothing() -> None:
 
 
 def test_credible_pixels() -> None:
-    made = scene(3, reach=0.1, num_alike=2)
+    made, wall = wall_scene(3)
     rng = np.random.default_rng(10)
-    plane = planes_near(rng, (HEIGHT, WIDTH))
+    plane = (wall * rng.normal(1, 0.004, (HEIGHT, WIDTH, 1))).astype(np.float32)
     wanted = np.zeros((HEIGHT, WIDTH), np.bool_)
-    wanted[8:-8:2, 10:-10:2] = True
+    wanted[4:-4, 4:-4] = rng.random((HEIGHT - 8, WIDTH - 8)) < 0.5
     credible, rate = np.empty((HEIGHT, WIDTH), np.bool_), np.empty((HEIGHT, WIDTH), np.float32)
-    max_cost, scratch = 0.6, cost.new_scratch(NUM_SOURCES)
+    max_cost, scratch = 0.15, cost.new_scratch(NUM_SOURCES)
     views = made.kernel_reference, made.kernel_sources, WINDOW, scratch
     credible_rows(0, HEIGHT, wanted, plane, np.float32(max_cost), *views, credible, rate)
-    assert not credible[~wanted].any()
-    sigmas = np.array([OPTIONS.sigma_space_px, OPTIONS.sigma_grey])
-    expected = np.zeros_like(credible)
+    expected, rates = np.zeros_like(credible), np.zeros(credible.shape)
     for y, x in np.argwhere(wanted):
         here = plane[y, x].astype(float)
-        confirming = plain.num_confirming(made.reference, made.sources, made.maps, x, y, here, max_cost, sigmas)
+        if plain.patch_variance(made.reference.grey, x, y, SIGMAS) < 2:
+            continue
+        confirming = plain.num_confirming(made.reference, made.sources, made.maps, x, y, here, max_cost, SIGMAS)
         expected[y, x] = confirming >= 2
-    rates = [plain.px_per_inverse_depth(made.reference, source, x, y, here[0]) for source in made.sources]
-    assert rate[y, x] == pytest.approx(max(rates), rel=1e-3)
-    assert 5 < expected.sum() < wanted.sum() - 10
-    assert np.count_nonzero(credible != expected) <= 2
+        rates[y, x] = max(plain.px_per_inverse_depth(made.reference, source, x, y, here[0]) for source in made.sources)
+    np.testing.assert_allclose(rate, rates, rtol=1e-3)
+    np.testing.assert_array_equal(credible, expected)
+    assert 30 < expected.sum() < wanted.sum() / 2
 
 
 def test_upsampling() -> None:
