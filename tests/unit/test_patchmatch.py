@@ -75,30 +75,6 @@ def test_a_wall_without_texture_gets_the_plane_of_its_edges(tmp_path: Path) -> N
     assert found[False] < 0.75
 
 
-def test_scaling_the_scene_scales_the_depth(tmp_path: Path) -> None:
-    one = run(plane_job(tmp_path / "one", normal=SLANTED))
-    # A power of two, so that all numbers keep their digits.
-    eight = run(plane_job(tmp_path / "eight", normal=SLANTED, scale=8.0))
-    for (depth, _), (scaled, _) in zip(one, eight, strict=True):
-        np.testing.assert_array_equal(depth > 0, scaled > 0)
-        np.testing.assert_allclose(scaled, 8 * depth, rtol=1e-5)
-
-
-def test_order_of_source_views_does_not_matter(tmp_path: Path) -> None:
-    job = plane_job(tmp_path / "a", normal=SLANTED)
-    turned = dataclasses.replace(plane_job(tmp_path / "b", normal=SLANTED), sources=tuple(s[::-1] for s in job.sources))
-    run(job)
-    run(turned)
-    assert map_bytes(job) == map_bytes(turned)
-
-
-def test_same_bytes_for_any_number_of_threads(tmp_path: Path) -> None:
-    one, two = (plane_job(tmp_path / name, normal=SLANTED) for name in ("one", "two"))
-    run(one, num_threads=1)
-    run(two, num_threads=2)
-    assert map_bytes(one) == map_bytes(two)
-
-
 def test_seed_changes_the_search_and_not_the_surface(tmp_path: Path) -> None:
     one, two = (plane_job(tmp_path / name, normal=SLANTED) for name in ("one", "two"))
     first, second = run(one), run(two, options=MvsOptions(seed=5))
