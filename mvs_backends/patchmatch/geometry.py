@@ -60,7 +60,15 @@ def warp(source: LevelCamera, reference: LevelCamera) -> NDArray[np.float32]:
 def depth_and_normal(
     plane: NDArray[np.float32], calibration: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Depth (H, W) and unit normal (H, W, 3) in the camera's frame, towards the camera; both 0 where w is 0."""
+    """Maps in COLMAP's terms of plane hypotheses.
+
+    Args:
+        plane: (H, W, 3) w, a, b; w = 0 where nothing is known.
+        calibration: (3, 3), pixel centres at whole numbers.
+
+    Returns:
+        Depth (H, W) and unit normal (H, W, 3) in the camera's frame, towards the camera; both 0 where w is 0.
+    """
     height, width = plane.shape[:2]
     w, a, b = np.moveaxis(plane, -1, 0)
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))

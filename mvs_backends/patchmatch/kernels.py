@@ -1,6 +1,7 @@
 """Compiled search for the plane of each pixel: start, propagation, view selection, refinement.
 
-Works on planes as `cost/kernels.py` defines them.
+Works on planes as `cost/kernels.py` defines them, after ACMM (Xu & Tao 2019). Random numbers depend on seed, sweep and
+pixel only, so that neither threads nor the order of pixels matter.
 """
 
 # Kernels are typed by what they are called with.
@@ -77,7 +78,7 @@ class Search(NamedTuple):
     perturbation_px: np.float32
     """Largest shift of a refined hypothesis in the source view."""
     normal_perturbation: np.float32
-    """Largest change of a refined normal, as a fraction of its length."""
+    """Largest change of each component of a refined unit normal."""
     min_angle_rad: np.float32
     """Triangulation angle below which a view loses weight."""
     random_depth: int
@@ -86,6 +87,7 @@ class Search(NamedTuple):
 
 @njit(forceinline=True, **COMPILED)
 def random_bits(state: np.uint64) -> np.uint64:
+    """The finaliser of splitmix64 (Steele, Lea & Flood 2014)."""
     state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return state ^ (state >> np.uint64(31))
@@ -93,6 +95,7 @@ def random_bits(state: np.uint64) -> np.uint64:
 
 @njit(forceinline=True, **COMPILED)
 def uniform(state: np.uint64) -> np.float32:
+    """A number in [0, 1), from the upper 24 bits."""
     return np.float32(np.int32(state >> np.uint64(40))) * _UNIT
 
 
@@ -107,7 +110,11 @@ def _seed(seed: int, iteration: int, pixel: int) -> np.uint64:
 
 @njit(forceinline=True, **COMPILED)
 def turned(x, y, w, a, b, amount, state, intrinsics):
-    """Slopes of the plane after a random vector of length up to `amount` is added to its unit normal."""
+    """Slopes of the plane (w, a, b) of pixel (x, y) after its unit normal is changed, the point at the pixel kept.
+
+    Up to `amount` is added to each component. The slopes stay as they are if the plane would face away or be seen at a
+    cosine of less than 0.1. `intrinsics`: (4,) fx, fy, cx, cy in pixels.
+    """
     fx, fy = intrinsics[0], intrinsics[1]
     rx, ry = (np.float32(x) - intrinsics[2]) / fx, (np.float32(y) - intrinsics[3]) / fy
     nx, ny = a * fx, b * fy
@@ -372,9 +379,21 @@ def _update_pixel(x, y, variance, state, reference, sources, window, search, scr
 
 @njit(cache=True, **COMPILED)
 def sweep_rows(first_row, last_row, colour, state, reference, sources, window, search, scratch):
-    """Update the pixels of one checkerboard colour in a band of rows.
+    """Update the pixels of one checkerboard colour in a band of rows: propagate, select views, refine.
 
-    Reads pixels of the other colour only, so bands may run at the same time and in any order.
+    Reads pixels of the other colour only, so bands may run at the same time and in any order. Pixels whose window has
+    no texture stay as they are.
+
+    Args:
+        first_row: of the band.
+        last_row: one past the band.
+        colour: 0 or 1, the parity of x + y.
+        state: (H, W) maps, changed in place.
+        reference: the view whose maps these are.
+        sources: N source views; with hypothesis maps if `search.geometric_weight` is greater than 0.
+        window: the matching window.
+        search: what steers the sweep.
+        scratch: memory of the band's own, for N views.
     """
     for y in range(first_row, last_row):
         for x in range((y + colour) & 1, reference.inverse_range.shape[1], 2):
@@ -387,7 +406,13 @@ def sweep_rows(first_row, last_row, colour, state, reference, sources, window, s
 
 @njit(cache=True, **COMPILED)
 def initialise_rows(first_row, last_row, num_random, state, reference, sources, window, search, scratch):
-    """Give each pixel of a band of rows the best of its hypothesis so far and random ones, by its better views."""
+    """Give each pixel of a band of rows the best of its hypothesis so far and random ones, by its better views.
+
+    `state.plane` (H, W, 3) holds hypotheses to begin with, w = 0 where there is none; the state is changed in place.
+    Random depths are drawn one from each of `num_random` equal parts of the pixel's interval of inverse depth, normals
+    around that of a plane parallel to the image. A hypothesis is judged by the mean of its `search.max_views` least
+    costs. Other arguments as in `sweep_rows`.
+    """
     width = reference.inverse_range.shape[1]
     num_views = sources.warp.shape[0]
     kept = min(search.max_views, num_views)

@@ -168,7 +168,12 @@ def pack_neighbours(grey: NDArray[np.uint8], out: NDArray[np.uint32]) -> None:
 
 @njit(forceinline=True, **COMPILED)
 def sample_reference(grey, x, y, window, weight, centred):
-    """Fill the window's normalised bilateral weights and weighted, centred grey values; return the variance."""
+    """Fill the window's normalised bilateral weights and weighted, centred grey values; return the variance.
+
+    Weights fall off with the distance and the difference of grey values to the pixel (x, y), after COLMAP (Schoenberger
+    et al. 2016); outside the image they are 0. `grey` is padded by 5 pixels (`Reference.padded_grey`), `weight` and
+    `centred` are (32,) and written; the variance is weighted too, in grey values squared.
+    """
     px, py = x + PADDING, y + PADDING
     center = np.int32(grey[py, px])
     total, mean, square = _ZERO, _ZERO, _ZERO
@@ -196,7 +201,11 @@ def sample_reference(grey, x, y, window, weight, centred):
 
 @njit(forceinline=True, **COMPILED)
 def view_cost(j, pixel_x, pixel_y, w, a, b, variance, sources, window, scratch):
-    """1 - bilateral NCC of the plane (w, a, b) at a pixel in source view j, after `sample_reference` there."""
+    """1 - bilateral NCC of the plane (w, a, b) at a pixel in source view j, after `sample_reference` there.
+
+    In [0, 2]; 2 too where the patch is not before the view, mostly outside its image, or without texture in it.
+    `variance`: as `sample_reference` returned it, at least MIN_VARIANCE.
+    """
     x, y = np.float32(pixel_x), np.float32(pixel_y)
     warp, texels, first, width = sources.warp[j], sources.texels, sources.first[j], sources.width[j]
     limit_x, limit_y = sources.limit[j, 0], sources.limit[j, 1]
@@ -286,7 +295,10 @@ def geometric_error(j, x, y, w, sources, cap):
 
 @njit(forceinline=True, **COMPILED)
 def px_per_inverse_depth(j, x, y, w, warp):
-    """How fast the pixel's projection moves in source view j, in pixels per unit of inverse depth."""
+    """How fast the pixel's projection moves in source view j, in pixels per unit of inverse depth; 0 behind it.
+
+    `warp`: (N, 12) as in `Sources`.
+    """
     t = warp[j]
     fx, fy = np.float32(x), np.float32(y)
     z = t[6] * fx + t[7] * fy + t[8] + t[11] * w
@@ -301,7 +313,10 @@ def px_per_inverse_depth(j, x, y, w, warp):
 
 @njit(forceinline=True, **COMPILED)
 def angle_factor(j, x, y, w, centers, intrinsics, min_angle):
-    """(0, 1]: falls off quadratically below the smallest triangulation angle that is worth much."""
+    """(0, 1]: falls off quadratically below the smallest triangulation angle that is worth much, `min_angle` radians.
+
+    `centers` (N, 3) in the reference camera's frame, `intrinsics` (4,) fx, fy, cx, cy in pixels.
+    """
     rx = (np.float32(x) - intrinsics[2]) / intrinsics[0]
     ry = (np.float32(y) - intrinsics[3]) / intrinsics[1]
     # Scaled by w, so that a far point needs no large numbers: the point is r, the centre c w.
@@ -314,7 +329,7 @@ def angle_factor(j, x, y, w, centers, intrinsics, min_angle):
 
 @njit(forceinline=True, **COMPILED)
 def facing(x, y, w, a, b, intrinsics):
-    """Cosine between the plane's normal and the viewing ray, positive when the plane faces the camera."""
+    """Cosine between the plane's normal and the ray of pixel (x, y), positive when the plane faces the camera."""
     nx, ny = a * intrinsics[0], b * intrinsics[1]
     rx, ry = (np.float32(x) - intrinsics[2]) / intrinsics[0], (np.float32(y) - intrinsics[3]) / intrinsics[1]
     nz = w - nx * rx - ny * ry
