@@ -12,7 +12,10 @@ from app.view_selection.kernels import count_distinct, undominated
 
 def count_views(bits: NDArray[np.uint64]) -> NDArray[np.int64]:
     """(R,) number of views in each packed row (R, words)."""
-    counts: NDArray[np.int64] = np.bitwise_count(bits).sum(axis=1, dtype=np.int64)
+    counts = np.zeros(len(bits), dtype=np.int64)
+    # Word by word: NumPy's sums over a short axis are slow.
+    for word in bits.T:
+        counts += np.bitwise_count(word)
     return counts
 
 
@@ -78,6 +81,6 @@ def reduce_rows(rows: CoveringRows, fixed: NDArray[np.uint64]) -> CoveringRows:
     bounds = rows.bounds - count_views(rows.bits & fixed)
     open_rows = CoveringRows(bits=(rows.bits & ~fixed)[bounds > 0], bounds=bounds[bounds > 0])
     # Fewer views and higher bounds first: a row can only be implied by one before it.
-    order = np.lexsort((*open_rows.bits.T, -open_rows.bounds, open_rows.sizes))
+    order = np.lexsort((-open_rows.bounds, open_rows.sizes))
     ordered = open_rows[order]
     return ordered[undominated(ordered.bits, ordered.bounds)]
