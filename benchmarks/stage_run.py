@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from app import cli  # noqa: F401 - for what it sets for all processes of a command
 from app.clustering.options import BlockVisibility, ClusteringOptions
 from app.clustering.stage import cluster
 from app.view_selection.options import SelectionMethod, SelectionOptions, Visibility
