@@ -38,7 +38,7 @@ class Hypotheses:
 
 
 def window(options: PatchMatchOptions) -> Window:
-    """The matching window: every second pixel of 11 x 11, without the corners."""
+    """The matching window, every second pixel of 11 x 11 without the corners, and its bilateral weights."""
     offsets = [(x, y) for y in range(-5, 6, 2) for x in range(-5, 6, 2) if abs(x) + abs(y) < 10]
     dx, dy = np.array(offsets, np.float32).T.copy()
     grey = np.arange(256, dtype=np.float32)
@@ -64,7 +64,17 @@ def sparse_points_in_image(
 
 
 def inverse_range(job: MvsJob, view: int, camera: LevelCamera, mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
-    """(H, W, 2) smallest and largest inverse depth of each pixel; 0, 0 where nothing is wanted."""
+    """Where each pixel's ray passes through the region, not nearer than the view's sparse points allow.
+
+    Args:
+        job: the cluster.
+        view: the reference view.
+        camera: the view at the level being searched.
+        mask: (H, W) pixels that are wanted; all if there is none.
+
+    Returns:
+        (H, W, 2) smallest and largest inverse depth; 0, 0 where nothing is wanted.
+    """
     entry, leave = depth_range(job.views[view], job.boxes_in_world, camera.width, camera.height)
     _, inverse_depths = sparse_points_in_image(job, view, camera)
     if len(inverse_depths) >= _MIN_SPARSE_POINTS:
@@ -152,7 +162,7 @@ class LevelSearch:
         for _ in self.executor.map(run, range(0, self.reference.inverse_range.shape[0], _ROWS_PER_TASK)):
             pass
 
-    def _search(self, iteration: int, last: int, random_depth: bool) -> Search:
+    def _search(self, iteration: int, random_depth: bool) -> Search:
         options = self.options
         geometric = len(self.sources.plane_size) > 0
         # Wide at first, below a tenth of a pixel at last.
@@ -170,21 +180,27 @@ class LevelSearch:
         )
 
     def start(self, sparse: NDArray[np.float32]) -> Hypotheses:
-        """The best of planes between sparse points and random ones."""
+        """The best of planes between sparse points, (H, W, 3) as of `interpolated_planes`, and random ones."""
         state = State(
             plane=sparse.copy(),
             cost=np.empty(sparse.shape[:2], np.float32),
             best_view=np.empty(sparse.shape[:2], np.int8),
         )
-        search = self._search(0, 1, True)
+        search = self._search(0, True)
         self._over_bands(initialise_rows, self.options.num_random, state, search)
         return Hypotheses(plane=state.plane, cost=state.cost, view=state.best_view)
 
-    def sweep(self, start: Hypotheses, iterations: int, random_depth: bool, first_iteration: int = 0) -> Hypotheses:
-        """Improve hypotheses by so many sweeps over the image."""
+    def sweep(self, start: Hypotheses, iterations: int, random_depth: bool) -> Hypotheses:
+        """Improve hypotheses by so many sweeps over the image.
+
+        Args:
+            start: what to improve; it stays as it is.
+            iterations: how many sweeps; later ones search less widely.
+            random_depth: whether to try depths from the whole interval as well.
+        """
         state = State(plane=start.plane.copy(), cost=start.cost.copy(), best_view=start.view.copy())
-        for iteration in range(first_iteration, first_iteration + iterations):
-            search = self._search(iteration, iterations, random_depth)
+        for iteration in range(iterations):
+            search = self._search(iteration, random_depth)
             for colour in (0, 1):
                 self._over_bands(sweep_rows, colour, state, search)
         return Hypotheses(plane=state.plane, cost=state.cost, view=state.best_view)
