@@ -88,6 +88,22 @@ def assert_alike(state: search.State, expected: plain.Maps) -> None:
     assert np.count_nonzero(differs) <= 8
 
 
+def test_turned_planes() -> None:
+    """Where the turned plane would face away or be seen at a flat angle, it stays as it was."""
+    made, wall = wall_scene(0)
+    rng = np.random.default_rng(1)
+    num_kept = 0
+    for _ in range(200):
+        x, y, amount = int(rng.integers(WIDTH)), int(rng.integers(HEIGHT)), np.float32(rng.uniform(0.1, 1.5))
+        plane = (wall[y, x] * [1, *rng.uniform(-10, 10, 2)]).astype(np.float32)
+        state = int(rng.integers(2**63))
+        found = search.turned(x, y, *plane, amount, np.uint64(state), made.kernel_reference.intrinsics)
+        expected = plain.turned(made.reference, x, y, plane.astype(float), float(amount), state)
+        np.testing.assert_allclose(found, expected[1:], rtol=1e-3, atol=1e-6)
+        num_kept += np.array_equal(found, plane[1:])
+    assert 10 < num_kept < 100
+
+
 @pytest.mark.parametrize(
     ("seed", "colour", "changed"),
     [
