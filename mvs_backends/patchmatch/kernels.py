@@ -135,7 +135,7 @@ def turned(x, y, w, a, b, amount, state, intrinsics):
 
 @njit(forceinline=True, **COMPILED)
 def _gather_candidates(x, y, state, low, high, scratch):
-    """Adaptive checkerboard sampling (ACMM section 3.1): the best hypothesis of each of 8 areas, moved here.
+    """Adaptive checkerboard sampling (ACMM): the best hypothesis of each of 8 areas, moved here.
 
     Row 0 of `candidates` (9, 3) is the pixel's own. Returns how many rows are filled.
     """
@@ -210,7 +210,7 @@ def _least_cost_view(count, num_views, costs):
 
 @njit(forceinline=True, **COMPILED)
 def _select_views(x, y, w, count, previous, reference, sources, search, scratch):
-    """Multi-hypothesis joint view selection (ACMM section 3.2).
+    """Multi-hypothesis joint view selection (ACMM).
 
     Writes the views' weights and the best of them, best first, into scratch. Returns how many are chosen, at least one.
     """

@@ -259,7 +259,7 @@ def view_cost(j, pixel_x, pixel_y, w, a, b, variance, sources, window, scratch):
 
 @njit(forceinline=True, **COMPILED)
 def geometric_error(j, x, y, w, sources, cap):
-    """Forward-backward reprojection error e in reference pixels, at most `cap` (ACMM section 4), as e^2 / (1 + e).
+    """Forward-backward reprojection error e in reference pixels, at most `cap` (ACMM), as e^2 / (1 + e).
 
     Flat at 0, unlike ACMM's: the maps of the pass before, half as fine, must not pull the depth within a pixel.
     """
