@@ -74,9 +74,13 @@ def associate(scene: PosedScene, options: ClusteringOptions, num_threads: int = 
     centers = scene.centers_in_world
     grid, cells, counts, num_far = _occupied_cells(scene.points_in_world, centers, options)
     finder = _BlockFinder(scene, options, grid, centers)
-    # The rest is too quick for threads, which would wait for each other's Python.
-    with ThreadPoolExecutor(num_threads if options.visibility is BlockVisibility.OCCLUDED else 1) as threads:
-        found = list(threads.map(finder.find, map(tuple, cells.tolist()), counts.tolist()))
+    wanted = map(tuple, cells.tolist()), counts.tolist()
+    if options.visibility is BlockVisibility.OCCLUDED:
+        with ThreadPoolExecutor(num_threads) as threads:
+            found = list(threads.map(finder.find, *wanted))
+    else:
+        # Too quick for threads, which would wait for each other's Python.
+        found = list(map(finder.find, *wanted))
     return Blocks(
         grid=grid,
         kept=[block for block in found if isinstance(block, Block)],
