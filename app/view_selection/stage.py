@@ -154,7 +154,17 @@ def _solved(arguments: tuple[Any, ...], num_clusters: int, num_workers: int) -> 
     """Selections in the order of the clusters, with few of them in memory; this process is one of the workers."""
     batches = iter([range(first, min(first + _BATCH, num_clusters)) for first in range(0, num_clusters, _BATCH)])
     solved = deque[Future[list[Selection]]]()
-    with _started_workers(num_workers - 1, arguments) as executor:
+    if num_workers == 1:
+        selector = _Selector(*arguments)
+        for batch in batches:
+            yield from selector.select(batch)
+        return
+    with ProcessPoolExecutor(
+        num_workers - 1,
+        multiprocessing.get_context("spawn"),
+        initializer=_start_worker,
+        initargs=(os.getpid(), *arguments),
+    ) as executor:
 
         def hand_out() -> None:
             under_way = sum(not batch.done() for batch in solved)
@@ -173,13 +183,3 @@ def _solved(arguments: tuple[Any, ...], num_clusters: int, num_workers: int) -> 
                 return
             while solved and (own is None or solved[0].done()):
                 yield from solved.popleft().result()
-
-
-def _started_workers(count: int, arguments: tuple[Any, ...]) -> ProcessPoolExecutor:
-    """Processes that are started as they are needed."""
-    return ProcessPoolExecutor(
-        max(count, 1),
-        multiprocessing.get_context("spawn"),
-        initializer=_start_worker,
-        initargs=(os.getpid(), *arguments),
-    )
