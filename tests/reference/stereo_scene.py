@@ -70,8 +70,10 @@ def scene(seed: int) -> Scene:
     return _for_kernels(cameras, maps)
 
 
-def wall_scene(seed: int) -> tuple[Scene, NDArray[np.float64]]:
-    """Views of a slanted wall about 5 away, and maps that lie near it. The wall's right half has no texture:
+def wall_scene(seed: int, *, ahead: bool = False) -> tuple[Scene, NDArray[np.float64]]:
+    """Views of a slanted wall about 5 away, the last perhaps from straight ahead, and maps that lie near it.
+
+    The wall's right half has no texture:
 
         | texture |  bare  |
         | texture |  shade |
@@ -81,6 +83,8 @@ def wall_scene(seed: int) -> tuple[Scene, NDArray[np.float64]]:
     """
     rng = np.random.default_rng(seed)
     cameras = random_cameras(rng, 0.5)
+    if ahead:
+        cameras[-1].pose[:, 3] = 0.0, 0.0, -1.0
     normal, offset = np.array([0.3, -0.2, 1.0]), 5.0
     planes = []
     for camera in cameras:

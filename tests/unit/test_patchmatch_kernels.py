@@ -32,14 +32,15 @@ def test_packed_neighbours_are_the_four_pixels() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_patch_cost(seed: int) -> None:
-    made, wall = wall_scene(seed)
+    made, wall = wall_scene(seed, ahead=True)
     rng = np.random.default_rng(seed + 100)
     scratch = cost.new_scratch(NUM_SOURCES)
     found, expected = [], []
     for _ in range(100):
         x, y = int(rng.integers(0, WIDTH)), int(rng.integers(0, HEIGHT))
         nearer = rng.choice([1, 1.02, rng.uniform(-1, 30)])
-        plane = (wall[y, x] * nearer + rng.normal(0, [0, 1e-3, 1e-3])).astype(np.float32)
+        slant = rng.choice([1e-3, 0.2])
+        plane = (wall[y, x] * nearer + rng.normal(0, [0, slant, slant])).astype(np.float32)
         grey = made.kernel_reference.padded_grey
         variance = cost.sample_reference(grey, x, y, WINDOW, scratch.weight, scratch.centred)
         assert variance == pytest.approx(plain.patch_variance(made.reference.grey, x, y, SIGMAS), rel=1e-3, abs=1e-2)

@@ -81,10 +81,9 @@ def start(seed: int) -> tuple[plain.Views, plain.Maps, search.State, tuple[objec
 
 
 def assert_alike(state: search.State, expected: plain.Maps) -> None:
-    """Costs agree, and so do planes, but for a few pixels where two cost the same to rounding."""
-    np.testing.assert_allclose(state.cost, expected.cost, atol=2e-3)
-    np.testing.assert_array_equal(state.best_view, expected.view)
+    """All agrees, but for a few pixels where two planes cost the same to rounding."""
     differs = np.any(np.abs(state.plane - expected.plane) > 2e-6, axis=-1)
+    differs |= (np.abs(state.cost - expected.cost) > 1e-3) | (state.best_view != expected.view)
     assert np.count_nonzero(differs) <= 8
 
 
@@ -125,7 +124,10 @@ def test_sweep(seed: int, colour: int, changed: dict[str, float]) -> None:
 def test_start(seed: int, num_random: int, max_views: int) -> None:
     settings = replace(SETTINGS, max_views=max_views)
     views, maps, state, arguments = start(seed)
-    state.plane[:, 10:20] = maps.plane[:, 10:20] = 0
+    state.plane[:, 10:20] = 0
+    # Out of range, so moved to its end.
+    state.plane[::3] *= 1.5
+    maps.plane[:] = state.plane
     scratch = cost.new_scratch(NUM_SOURCES)
     search.initialise_rows(0, HEIGHT, num_random, state, *arguments, for_kernels(settings), scratch)
     assert_alike(state, plain.initialised(views, maps.plane, num_random, settings))
