@@ -1,7 +1,8 @@
 """[O]'s table 1 beside the same rows of the program, on simulated drives with [O]'s numbers of views and keypoints.
 
 python -m benchmarks.drives seq1 MODELS/seq1        (and seq2 ... seq5)
-python -m benchmarks.paper_table MODELS [--sequences seq1 seq5] [--repeats 3] [--reference] [--every 4]
+python -m benchmarks.paper_table MODELS [--sequences seq1 seq5] [--repeats 3] [--max-pictures 0]
+                                        [--reference] [--every 4]
 
 [O]'s times are those of its paper: C++ on an Intel Core i5-5300U. With ``--reference`` the plain reference
 (benchmarks/reference) clusters each drive too, and selects for every so many of its clusters, on one thread.
@@ -27,7 +28,7 @@ from benchmarks.machine import describe_machine
 from benchmarks.reference.clustering import PlainCluster, plain_clusters
 from benchmarks.reference.quality import plain_quality
 from benchmarks.reference.selection import best_quality, meets_all, plain_program, solve
-from benchmarks.stage_run import StageRun, median_run, run_stages
+from benchmarks.stage_run import MAX_PICTURES, StageRun, median_run, run_stages
 
 PAPER = {
     "views N": (5131, 6782, 8477, 9912, 11956),
@@ -55,6 +56,7 @@ def main() -> None:
     parser.add_argument("--sequences", nargs="+", choices=SEQUENCES, default=SEQUENCES)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=1, help="runs of each drive, of which medians are printed")
+    parser.add_argument("--max-pictures", type=int, default=MAX_PICTURES, help="of clusters")
     parser.add_argument("--reference", action="store_true")
     parser.add_argument("--every", type=int, default=1, help="the reference selects for every so many clusters")
     arguments = parser.parse_args()
@@ -62,14 +64,14 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         run_stages(arguments.models / arguments.sequences[0], Path(scratch), SelectionMethod.OPTIMAL, arguments.workers)
         print("kernels compiled before; times are CPU-s of all processes (wall s), reading and writing included;")
-        print(f"medians of {arguments.repeats} runs\n")
+        print(f"at most {arguments.max_pictures} pictures of clusters; medians of {arguments.repeats} runs\n")
         columns, runs = [], {}
         for name in arguments.sequences:
             for method in SelectionMethod:
                 folder = Path(scratch) / name / method
                 runs[name, method] = median_run(
                     [
-                        run_stages(arguments.models / name, folder, method, arguments.workers)
+                        run_stages(arguments.models / name, folder, method, arguments.workers, arguments.max_pictures)
                         for _ in range(arguments.repeats)
                     ]
                 )

@@ -18,6 +18,8 @@ from app.clustering.stage import cluster
 from app.view_selection.options import SelectionMethod, SelectionOptions, Visibility
 from app.view_selection.stage import select
 
+MAX_PICTURES = SelectionOptions().max_pictures
+
 
 @dataclass(frozen=True, kw_only=True)
 class Cost:
@@ -62,7 +64,9 @@ def median_run(runs: Sequence[StageRun]) -> StageRun:
     )
 
 
-def run_stages(model_dir: Path, output_dir: Path, method: SelectionMethod, num_workers: int) -> StageRun:
+def run_stages(
+    model_dir: Path, output_dir: Path, method: SelectionMethod, num_workers: int, max_pictures: int = MAX_PICTURES
+) -> StageRun:
     """Cluster and select in a new process, as the commands do.
 
     Args:
@@ -70,8 +74,10 @@ def run_stages(model_dir: Path, output_dir: Path, method: SelectionMethod, num_w
         output_dir: Gets ``clusters/`` and ``selection/``.
         method: Of selection.
         num_workers: Of selection.
+        max_pictures: Of selection.
     """
-    command = [sys.executable, "-m", __name__, str(model_dir), str(output_dir), method, str(num_workers)]
+    values = map(str, (model_dir, output_dir, method, num_workers, max_pictures))
+    command = [sys.executable, "-m", __name__, *values]
     peak_gib = 0.0
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         while process.poll() is None:
@@ -96,7 +102,7 @@ def _resident_gib(pid: int) -> float:
     return own_kib / 2**20 + sum(_resident_gib(int(child)) for child in children)
 
 
-def _main(model_dir: str, output_dir: str, method: str, num_workers: str) -> None:
+def _main(model_dir: str, output_dir: str, method: str, num_workers: str, max_pictures: str) -> None:
     folder = Path(output_dir)
     (folder / "clusters").mkdir(parents=True, exist_ok=True)
     started = _now()
@@ -104,7 +110,9 @@ def _main(model_dir: str, output_dir: str, method: str, num_workers: str) -> Non
     clustering = ClusteringOptions(visibility=BlockVisibility.FRUSTUM)
     cluster(Path(model_dir), folder / "clusters", options=clustering)
     clustered = _now()
-    selection = SelectionOptions(method=SelectionMethod(method), visibility=Visibility.FRUSTUM)
+    selection = SelectionOptions(
+        method=SelectionMethod(method), visibility=Visibility.FRUSTUM, max_pictures=int(max_pictures)
+    )
     select(folder / "clusters", folder / "selection", options=selection, num_workers=int(num_workers))
     selected = _now()
     costs = {
