@@ -21,7 +21,7 @@ from app.options import DensifyOptions
 from app.scene.point_index import PointIndex
 from app.scene.posed_scene import PosedScene
 from app.scene.submodel import write_submodel
-from app.sky import find_sky
+from app.sky import find_sky, redness_limit, redness_of_sky
 from app.workspace import atomic_file
 from fusion.region import GroundRegion
 from mvs_backends.base import MvsJob, MvsView
@@ -158,7 +158,10 @@ def prepare_workspace(
     for image in job.images:
         camera = job.cameras[image.camera_id].camera()
         _undistort_image(image_root / image.name, workspace / "images" / image.name, camera, undistortion)
-        unwanted = _sky(mvs_job, row_of_name[image.name]) if options.skip_sky else None
+    redness = redness_limit([_redness_of_sky(mvs_job, row) for row in row_of_name.values()] if options.skip_sky else [])
+    for image in job.images:
+        camera = job.cameras[image.camera_id].camera()
+        unwanted = _sky(mvs_job, row_of_name[image.name], redness)[1] if options.skip_sky else None
         given = mask_root / f"{image.name}.png" if mask_root is not None else None
         _write_mask(workspace / "masks" / f"{image.name}.png", given, unwanted, camera, undistortion)
     _write_stereo_folder(mvs_job)
@@ -177,19 +180,25 @@ def _undistort_image(
     _write_image(target, np.asarray(cv2.cvtColor(undistorted.to_array(), cv2.COLOR_RGB2BGR), dtype=np.uint8))
 
 
-def _sky(job: MvsJob, row: int) -> NDArray[np.bool_]:
-    """(H, W) where an undistorted image shows the sky."""
+def _redness_of_sky(job: MvsJob, row: int) -> float:
+    return redness_of_sky(*_sky(job, row, max_red_over_blue=255))
+
+
+def _sky(job: MvsJob, row: int, max_red_over_blue: float) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """An undistorted image (H, W, 3), and (H, W) where it shows the sky."""
     view = job.views[row]
     in_camera = job.points_in_world[job.point_views[row]] @ view.cam_from_world[:, :3].T + view.cam_from_world[:, 3]
     pixels = in_camera @ view.calibration.T
-    image = cv2.imread(str(job.image_path(row)), cv2.IMREAD_COLOR)
-    if image is None:
+    read = cv2.imread(str(job.image_path(row)), cv2.IMREAD_COLOR)
+    if read is None:
         raise CityReconError(f"cannot read {job.image_path(row)}; remove {job.workspace} and run the command again")
-    return find_sky(
-        np.asarray(image, dtype=np.uint8),
+    image = np.asarray(read, dtype=np.uint8)
+    return image, find_sky(
+        image,
         calibration=view.calibration,
         cam_from_world=view.cam_from_world,
         keypoints_px=pixels[:, :2] / pixels[:, 2:],
+        max_red_over_blue=max_red_over_blue,
     )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from app.sky import find_sky
+from app.sky import MAX_RED_OVER_BLUE, find_sky, redness_limit, redness_of_sky
 from tests.small_street import STREET
 
 K = np.array([[200.0, 0, 160], [0, 200, 100], [0, 0, 1]])
@@ -50,6 +50,39 @@ def test_an_area_with_keypoints_is_a_wall() -> None:
     sky = sky_of(picture(), wall)
     assert sky[:95, :150].all()
     assert not sky[:, 175:].any()
+
+
+def test_keypoints_of_a_roof_along_its_edge_do_not_make_the_sky_a_wall() -> None:
+    roof = [(x, 99.0) for x in np.linspace(5, 150, 40)]
+    assert sky_of(picture(), roof)[:95, :150].all()
+
+
+def test_a_line_that_undistortion_leaves_black_is_not_the_end_of_the_sky() -> None:
+    lined = picture()
+    lined[:1] = lined[-1:] = 0
+    assert sky_of(lined, [])[10:95, :150].all()
+
+
+def test_a_deep_blue_sky_is_darker_than_the_houses() -> None:
+    image = picture()
+    image[:100, :158] = (150, 90, 50)
+    image[:100, 162:] = (200, 210, 255)
+    sky = sky_of(image, [])
+    assert sky[:95, :150].all()
+    assert not sky[:, 175:].any()
+
+
+def test_a_sky_that_is_reddish_in_all_images() -> None:
+    dusk = np.ascontiguousarray(picture()[:, :, ::-1])
+    allowed = find_sky(
+        dusk, calibration=K, cam_from_world=CAM_FROM_WORLD, keypoints_px=np.empty((0, 2)), max_red_over_blue=255
+    )
+    assert redness_of_sky(dusk, allowed) == 50
+    assert np.isnan(redness_of_sky(dusk, np.zeros_like(allowed)))
+    none = float("nan")
+    assert 50 < redness_limit([50.0, 48.0, 52.0, 50.0, none, 51.0, 49.0]) < 75
+    for other in ([50.0] * 4, [50.0] * 5 + [0.0] * 2, [50.0] * 5 + [none] * 6, [20.0, 40, 60, 80, 100, 120], []):
+        assert redness_limit(other) == MAX_RED_OVER_BLUE
 
 
 @pytest.mark.parametrize("turns", [1, 2, 3])
