@@ -9,7 +9,8 @@ import shutil
 import tempfile
 import time
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from mvs_backends.base import Availability, MvsBackend, MvsJob, MvsOptions, Progress
 from mvs_backends.colmap_maps import has_maps, write_maps
 from mvs_backends.masks import read_mask
+from mvs_backends.patchmatch.averaging import averaged_planes
 from mvs_backends.patchmatch.cost.kernels import PADDING, Reference
 from mvs_backends.patchmatch.geometry import LevelCamera, depth_and_normal, level_camera
 from mvs_backends.patchmatch.images import ImageCache
@@ -74,7 +76,8 @@ def estimate_maps(
     """Depth and normal maps of all reference views of a job.
 
     Every pass runs over all views before the next one begins, since a geometric pass compares a view with its source
-    views' maps of the pass before. What a pass found for a view is kept in `stereo/patchmatch/` until all is done.
+    views' maps of the pass before; at the end each map is averaged with all others. What a pass found for a view is
+    kept in `stereo/patchmatch/` until all is done.
 
     Raises:
         MvsError: an image or mask can't be read.
@@ -82,26 +85,26 @@ def estimate_maps(
     if all(has_maps(job, view) for view in range(len(job.views))):
         return
     num_levels = len(options.iterations)
-    total = num_levels * len(job.views)
+    total = (num_levels + 1) * len(job.views)
     folder = _kept_folder(job, options, seed)
     with ThreadPoolExecutor(num_threads) as executor:
         images = ImageCache(job)
-        for number in range(num_levels):
+        for number in range(num_levels + 1):
             for view in range(len(job.views)):
-                last = number == num_levels - 1
+                last = number == num_levels
                 done = has_maps(job, view) if last else _kept_file(folder, number, view).exists()
                 if not done:
                     started = time.perf_counter()
-                    found = _search_view(job, view, number, options, seed, images, folder, executor)
                     if last:
-                        _write_maps(job, view, _full_size(job, view, found, options, images), options)
+                        _write_averaged(job, view, options, images, folder, executor)
                     else:
+                        found = _search_view(job, view, number, options, seed, images, folder, executor)
                         _save(_kept_file(folder, number, view), found)
                     logger.debug(
                         "%s: pass %d of %d in %.1f s",
                         job.views[view].name,
                         number + 1,
-                        num_levels,
+                        num_levels + 1,
                         time.perf_counter() - started,
                     )
                 if progress is not None:
@@ -161,6 +164,7 @@ def _search_view(
             found = search.with_planes(found)
         if options.smoothing_radius_px > 0:
             found = search.smoothed(found, options.smoothing_radius_px)
+        found.plane[~(found.cost <= options.max_cost)] = 0.0
     return found
 
 
@@ -187,10 +191,22 @@ def _level(options: PatchMatchOptions, number: int) -> int:
     return options.finest_level + len(options.iterations) - 1 - number
 
 
-def _write_maps(job: MvsJob, view: int, found: Hypotheses, options: PatchMatchOptions) -> None:
-    """Filter the last pass' hypotheses and leave them as COLMAP's maps."""
-    plane = found.plane.copy()
-    plane[~(found.cost <= options.max_cost)] = 0.0
+def _write_averaged(
+    job: MvsJob, view: int, options: PatchMatchOptions, images: ImageCache, folder: Path, executor: Executor
+) -> None:
+    """Leave the maps of a view, averaged with those of the other views, as COLMAP's."""
+    last, level = len(options.iterations) - 1, options.finest_level
+    found = _load(_kept_file(folder, last, view))
+    if options.average_views:
+        others = [
+            (level_camera(job.views[other], level), partial(_load_plane, _kept_file(folder, last, other)))
+            for other in sorted(job.sources[view])
+        ]
+        found = replace(
+            found, plane=averaged_planes(found.plane, level_camera(job.views[view], level), others, executor)
+        )
+    found = _full_size(job, view, found, options, images)
+    plane = np.where((found.cost <= options.max_cost)[..., None], found.plane, np.float32(0))
     plane[_speckles(plane[..., 0], options.min_speckle_px)] = 0.0
     depth, normal = depth_and_normal(plane, level_camera(job.views[view], 0).calibration)
     write_maps(job, view, depth, normal)
@@ -213,7 +229,7 @@ def _kept_folder(job: MvsJob, options: PatchMatchOptions, seed: int) -> Path:
     digest = hashlib.sha256(job.boxes_in_world.tobytes() + job.points_in_world.tobytes())
     for view in job.views:
         digest.update(view.name.encode() + view.calibration.tobytes() + view.cam_from_world.tobytes())
-    made_by = json.dumps([2, asdict(options), seed, job.sources, digest.hexdigest()], sort_keys=True)
+    made_by = json.dumps([3, asdict(options), seed, job.sources, digest.hexdigest()], sort_keys=True)
     folder = job.workspace / "stereo" / "patchmatch"
     label = folder / "made_by.json"
     if folder.exists() and not (label.exists() and label.read_text() == made_by):
@@ -231,6 +247,10 @@ def _save(path: Path, found: Hypotheses) -> None:
     partial = path.with_name(f".{path.stem}.partial.npz")
     np.savez(partial, plane=found.plane, cost=found.cost, view=found.view)
     partial.replace(path)
+
+
+def _load_plane(path: Path) -> NDArray[np.float32]:
+    return _load(path).plane
 
 
 def _load(path: Path) -> Hypotheses:

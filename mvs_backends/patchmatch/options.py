@@ -41,6 +41,8 @@ class PatchMatchOptions:
     """At the end, each plane is averaged with those that agree within so many pixels. 0: no."""
     min_speckle_px: int = 40
     """Smaller connected pieces of a depth map are removed."""
+    average_views: bool = True
+    """At the end, each pixel's inverse depth is averaged with those of the other views' maps that agree."""
 
     def __post_init__(self) -> None:
         for field in ("num_source_views", "max_cost_views", "num_random"):

@@ -253,3 +253,33 @@ def num_confirming(
         near = reprojection_error(reference, source, its_map, x, y, plane[0], 2.0) <= 0.5
         count += near and cost <= max_cost and min(others) > cost + 0.1
     return count
+
+
+def averaged(reference: Camera, sources: list[Camera], maps: Array, plane: Array) -> Array:
+    """(H, W) inverse depths, each the mean of its own and those where its ray meets the sources' planes near by."""
+    result = plane[..., 0].copy()
+    center = -reference.pose[:, :3].T @ reference.pose[:, 3]
+    for y, x in np.argwhere(plane[..., 0] > 0):
+        w = plane[y, x, 0]
+        here = point_on_plane(reference, float(x), float(y), np.array([w, 0, 0]), (x, y))
+        found, weights = [w], [1.0]
+        for source, its_map in zip(sources, maps, strict=True):
+            u, v, depth = project(source, here)
+            column, row = math.floor(u + 0.5), math.floor(v + 0.5)
+            inside = depth > 0 and 0 <= row < its_map.shape[0] and 0 <= column < its_map.shape[1]
+            if not inside or its_map[row, column, 0] <= 0:
+                continue
+            corners = [
+                point_on_plane(source, column + dx, row + dy, its_map[row, column], (column, row))
+                for dx, dy in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
+            ]
+            normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+            met = center + (here - center) * (normal @ (corners[0] - center)) / (normal @ (here - center))
+            there = 1 / (reference.pose[2, :3] @ met + reference.pose[2, 3])
+            half_px = 0.5 / px_per_inverse_depth(reference, source, x, y, w)
+            bound = max(0.01 * w, min(half_px, 0.03 * w))
+            if abs(there - w) < bound:
+                found.append(there)
+                weights.append((1 - ((there - w) / bound) ** 2) ** 2 / (w * depth) ** 2)
+        result[y, x] = np.average(found, weights=weights)
+    return result

@@ -72,7 +72,7 @@ def test_a_wall_without_texture_gets_the_plane_of_its_edges(tmp_path: Path) -> N
         right = (depth > 0) & (np.abs(depth / true_depth(job.views[1], direction, 5.0) - 1) < 0.01)
         found[prior] = right[bare].mean()
     assert found[True] > 0.95
-    assert found[False] < 0.75
+    assert found[False] < 0.8
 
 
 def test_seed_changes_the_search_and_not_the_surface(tmp_path: Path) -> None:

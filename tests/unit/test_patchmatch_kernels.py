@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
 from mvs_backends.patchmatch import kernels as search
+from mvs_backends.patchmatch.averaging import averaged_planes
 from mvs_backends.patchmatch.cost import kernels as cost
-from mvs_backends.patchmatch.geometry import depth_and_normal
+from mvs_backends.patchmatch.geometry import LevelCamera, depth_and_normal
 from mvs_backends.patchmatch.maps.kernels import credible_rows, smooth_rows, upsample
 from tests.reference import patchmatch as plain
 from tests.reference.stereo_scene import (
@@ -132,6 +135,28 @@ def test_credible_pixels() -> None:
     np.testing.assert_allclose(rate, rates, rtol=1e-3)
     np.testing.assert_array_equal(credible, expected)
     assert 30 < expected.sum() < wanted.sum() / 2
+
+
+@pytest.mark.parametrize("ahead", [False, True])
+def test_views_that_agree_are_averaged(ahead: bool) -> None:
+    made, wall = wall_scene(5, ahead=ahead)
+    rng = np.random.default_rng(11)
+    plane = (wall * rng.normal(1, 0.006, (HEIGHT, WIDTH, 1))).astype(np.float32)
+    plane[rng.random((HEIGHT, WIDTH)) < 0.1] = 0
+    maps = made.maps * np.where(rng.random((*made.maps.shape[:3], 1)) < 0.2, 1.1, 1).astype(np.float32)
+    level, *levels = (
+        LevelCamera(width=WIDTH, height=HEIGHT, calibration=camera.calibration, cam_from_world=camera.pose)
+        for camera in (made.reference, *made.sources)
+    )
+    loaders = [(its_level, lambda its_map=its_map: its_map) for its_level, its_map in zip(levels, maps, strict=True)]
+    with ThreadPoolExecutor(2) as executor:
+        found = averaged_planes(plane, level, loaders, executor)
+    expected = plain.averaged(made.reference, made.sources, maps.astype(float), plane.astype(float))
+    np.testing.assert_allclose(found[..., 0], expected, rtol=2e-5)
+    known = plane[..., 0] > 0
+    np.testing.assert_allclose(found[known, 1] / found[known, 0], plane[known, 1] / plane[known, 0], rtol=1e-4)
+    before, after = (np.std(w[known] / wall[known, 0]) for w in (plane[..., 0], found[..., 0]))
+    assert after < 0.7 * before
 
 
 def test_upsampling() -> None:

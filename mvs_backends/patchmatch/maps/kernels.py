@@ -28,6 +28,9 @@ _TINY = np.float32(1e-12)
 _MAX_GEOMETRIC_TERM = np.float32(0.5)
 _DISTINCT_STEP_PX, _DISTINCT_COST = np.float32(2), np.float32(0.1)
 _MIN_CONFIRMING = 2
+# Of a plane that the ray nearly lies in.
+_MIN_REST = np.float32(0.05)
+_AGREEING, _AGREEING_PX, _AGREEING_AT_MOST = np.float32(0.01), np.float32(0.5), np.float32(0.03)
 
 
 @njit(cache=True, **COMPILED)
@@ -139,3 +142,54 @@ def credible_rows(first_row, last_row, wanted, plane, max_cost, reference, sourc
                 if min(nearer, farther) > cost + _DISTINCT_COST:
                     confirming += 1
             credible[y, x] = confirming >= _MIN_CONFIRMING
+
+
+@njit(cache=True, **COMPILED)
+def add_agreeing_rows(first_row, last_row, plane, source, warp, sums):
+    """Add the inverse depths that a source view's planes give the pixels of a band of rows, where the two views agree.
+
+    A pixel's ray meets the plane of the source pixel that it projects to. If that is within 1 % of the pixel's own
+    inverse depth, or half a pixel in the source view but no more than 3 %, it is added, with a weight that falls to 0
+    at that bound, and with the square of the distance from the source view.
+
+    Args:
+        first_row: of the band.
+        last_row: after the band; may lie beyond the image.
+        plane: (H, W, 3) the view's own planes.
+        source: (H', W', 3) those of the source view.
+        warp: (12,) as in `Sources`.
+        sums: (H, W, 2) weights, and weights times inverse depths.
+    """
+    height, width = source.shape[:2]
+    for y in range(first_row, min(last_row, plane.shape[0])):
+        for x in range(plane.shape[1]):
+            w = plane[y, x, 0]
+            if w <= _ZERO:
+                continue
+            fx, fy = np.float32(x), np.float32(y)
+            p0 = warp[0] * fx + warp[1] * fy + warp[2]
+            p1 = warp[3] * fx + warp[4] * fy + warp[5]
+            p2 = warp[6] * fx + warp[7] * fy + warp[8]
+            q2 = p2 + warp[11] * w
+            if q2 <= _TINY:
+                continue
+            u, v = (p0 + warp[9] * w) / q2, (p1 + warp[10] * w) / q2
+            if not (-_HALF <= u < np.float32(width) - _HALF and -_HALF <= v < np.float32(height) - _HALF):
+                continue
+            column, row = np.int64(np.floor(u + _HALF)), np.int64(np.floor(v + _HALF))
+            there, a, b = source[row, column, 0], source[row, column, 1], source[row, column, 2]
+            if there <= _ZERO:
+                continue
+            # The source's plane is c . q = w for homogeneous source pixels q = p + k w.
+            c2 = there - a * np.float32(column) - b * np.float32(row)
+            rest = _ONE - (a * warp[9] + b * warp[10] + c2 * warp[11])
+            if abs(rest) < _MIN_REST:
+                continue
+            error = abs((a * p0 + b * p1 + c2 * p2) / rest - w)
+            moved = np.hypot(warp[9] - u * warp[11], warp[10] - v * warp[11]) / q2
+            bound = max(_AGREEING * w, min(_AGREEING_PX / max(moved, _TINY), _AGREEING_AT_MOST * w))
+            if error < bound:
+                closeness = _ONE - (error / bound) * (error / bound)
+                weight = closeness * closeness / (q2 * q2)
+                sums[y, x, 0] += weight
+                sums[y, x, 1] += weight * (a * p0 + b * p1 + c2 * p2) / rest
