@@ -19,7 +19,7 @@ _MAX_PLANES = 3
 # Of a region's credible pixels.
 _MIN_SHARE_FIRST, _MIN_SHARE_OTHER = 0.4, 0.15
 # A point lies on a plane, and a plane is known at a pixel, to the smaller of the two.
-_MAX_ERROR_PX, _MAX_RELATIVE_ERROR = 2.0, 0.015
+_MAX_ERROR_PX, _MAX_RELATIVE_ERROR = 3.0, 0.025
 # So many pixels' errors are alike, as their windows overlap.
 _CORRELATED_PX = 25
 
