@@ -23,8 +23,9 @@ class PatchMatchOptions:
     """Fit planes to the credible pixels of evenly coloured regions, and give them to the others there."""
     num_random: int = 8
     """Random hypotheses per pixel at the start, beside the one interpolated from sparse points. ACMM: 1."""
-    geometric_weight: float = 0.05
-    """Weight lambda of the forward-backward reprojection error. ACMM: 0.2. 0: photometric only."""
+    geometric_weight: float = 0.0
+    """Weight lambda of the forward-backward reprojection error in the cost. ACMM: 0.2. Against the coarser maps of the
+    pass before, it costs accuracy; views are made consistent by `average_views` and by the planar prior."""
     max_geometric_error_px: float = 3.0
     """Truncation delta of the reprojection error. ACMM: 3."""
     sigma_space_px: float = 5.0
