@@ -198,13 +198,16 @@ def _write_averaged(
     last, level = len(options.iterations) - 1, options.finest_level
     found = _load(_kept_file(folder, last, view))
     if options.average_views:
+        camera = level_camera(job.views[view], level)
         others = [
             (level_camera(job.views[other], level), partial(_load_plane, _kept_file(folder, last, other)))
             for other in sorted(job.sources[view])
         ]
-        found = replace(
-            found, plane=averaged_planes(found.plane, level_camera(job.views[view], level), others, executor)
-        )
+        plane = averaged_planes(found.plane, camera, others, executor)
+        limits = inverse_range(job, view, camera, read_mask(job, view, camera.width, camera.height))
+        known = plane[..., 0] > 0
+        plane[known, 0] = np.clip(plane[known, 0], limits[known, 0], limits[known, 1])
+        found = replace(found, plane=plane)
     found = _full_size(job, view, found, options, images)
     plane = np.where((found.cost <= options.max_cost)[..., None], found.plane, np.float32(0))
     plane[_speckles(plane[..., 0], options.min_speckle_px)] = 0.0
