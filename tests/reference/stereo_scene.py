@@ -70,7 +70,7 @@ def scene(seed: int) -> Scene:
     return _for_kernels(cameras, maps)
 
 
-def wall_scene(seed: int, *, ahead: bool = False) -> tuple[Scene, NDArray[np.float64]]:
+def wall_scene(seed: int, *, ahead: bool = False, reach: float = 0.5) -> tuple[Scene, NDArray[np.float64]]:
     """Views of a slanted wall about 5 away, the last perhaps from straight ahead, and maps that lie near it.
 
     The wall's right half has no texture:
@@ -82,7 +82,7 @@ def wall_scene(seed: int, *, ahead: bool = False) -> tuple[Scene, NDArray[np.flo
         The scene and (H, W, 3) the wall's plane at each pixel of the reference.
     """
     rng = np.random.default_rng(seed)
-    cameras = random_cameras(rng, 0.5)
+    cameras = random_cameras(rng, reach)
     if ahead:
         cameras[-1].pose[:, 3] = 0.0, 0.0, -1.0
     normal, offset = np.array([0.3, -0.2, 1.0]), 5.0
