@@ -10,13 +10,17 @@ world z up; the camera looks along world x, level, so the horizon is the middle 
 """
 
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from numpy.typing import NDArray
 
 from app.sky import MAX_RED_OVER_BLUE, find_sky, redness_limit, redness_of_sky
+from benchmarks.dense_workspace import make_workspace
+from mvs_backends.masks import read_mask
 from tests.small_street import STREET
 
 K = np.array([[200.0, 0, 160], [0, 200, 100], [0, 0, 1]])
@@ -131,3 +135,28 @@ def test_sky_of_the_sample_is_where_rays_miss_the_town(open3d, name: str) -> Non
     border = cv2.dilate(truth.astype(np.uint8), np.ones((13, 13), np.uint8)).astype(bool)
     assert not (found & ~border).any(), "nothing of the town is taken for sky"
     assert truth.sum() < 500 or (found & truth).sum() > 0.9 * truth.sum()
+
+
+@pytest.mark.parametrize("share_of_dusk", [1.0, 0.5])
+def test_masks_of_a_cluster_know_its_sky(tmp_path: Path, share_of_dusk: float) -> None:
+    """Reddish areas are the sky where all images have them, and walls beside a sky that is blue in the others."""
+    model, num_images = pycolmap.Reconstruction(), 6
+    camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=320, height=200, params=[200, 200, 160, 100])
+    model.add_camera_with_trivial_rig(camera)
+    ground = np.array([[x, y, z] for x in (6.0, 14.0) for y in (-3.0, 0, 3) for z in (-2.5, -1.0)])
+    for i in range(num_images):
+        dusk = i < share_of_dusk * num_images
+        cv2.imwrite(str(tmp_path / f"{i}.png"), np.ascontiguousarray(picture()[:, :, :: -1 if dusk else 1]))
+        pose = pycolmap.Rigid3d(CAM_FROM_WORLD)
+        seen = ground @ CAM_FROM_WORLD[:, :3].T
+        pixels = 200 * seen[:, :2] / seen[:, 2:] + [160, 100]
+        image = pycolmap.Image(name=f"{i}.png", keypoints=pixels, camera_id=1, image_id=i + 1)
+        model.add_image_with_trivial_frame(image, pose)
+    for index, point in enumerate(ground):
+        track = pycolmap.Track([pycolmap.TrackElement(i + 1, index) for i in range(num_images)])
+        model.add_point3D(point, track, np.zeros(3, np.uint8))
+    (tmp_path / "model").mkdir()
+    model.write_binary(str(tmp_path / "model"))
+    job = make_workspace(tmp_path / "work", model=tmp_path / "model", images=tmp_path, frames=range(num_images))
+    masked = [not read_mask(job, view, 320, 200)[20:80, 20:140].any() for view in range(num_images)]
+    assert masked == [share_of_dusk == 1.0 or i >= 3 for i in range(num_images)]
