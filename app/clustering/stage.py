@@ -100,7 +100,7 @@ def _log(report: dict[str, Any]) -> None:
         report["clusters_per_image"],
     )
     for reason, count in sorted(Counter(block["reason"] for block in report["dropped_blocks"]).items()):
-        logger.info("%d blocks dropped: %s", count, reason)
+        logger.info("%d %s dropped: %s", count, "block" if count == 1 else "blocks", reason)
     if report["images_in_no_cluster"]:
         logger.info("%d images see no cluster and are not used", len(report["images_in_no_cluster"]))
     for name, count in report["small_clusters"].items():
