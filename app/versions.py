@@ -9,7 +9,7 @@ from __future__ import annotations
 _VERSIONS = {
     "capture": 1,
     "sfm": 1,
-    "georegister": 1,
+    "georegister": 2,
     "cluster": 1,
     "select": 3,
     "jobs": 1,

@@ -14,7 +14,7 @@ _INLIER_SIGMAS = 3.0
 _KEPT_SIGMAS = 3.7
 """Where the noise is known: of 1,000 good positions one is left out."""
 _MIN_SIGMA_M = 1e-3
-_MAX_AUTOCORRELATION = 0.9
+_MIN_FREEDOM = 0.5
 _LEVER_SIGMA_M = 2.0
 """How far antennas are from cameras, before GPS says."""
 _MIN_LEVER_FRAMES = 10
@@ -156,6 +156,7 @@ def _refine(
     residuals = factor * source + basis @ coefficients - target
     arm = abs(factor) * math.sqrt(information)
     turn = factor / abs(factor) if abs(factor) > 0.0 else 1.0
+    inflation = correlation_inflation(residuals[inliers], 1 + basis.shape[1])
     return PlanarFit(
         scale=abs(factor),
         yaw_rad=float(np.angle(factor)),
@@ -164,7 +165,7 @@ def _refine(
         inliers=inliers,
         residuals_m=np.abs(residuals),
         sigma_m=noise,
-        scale_relative_sigma=noise * correlation_inflation(residuals[inliers]) / arm if arm > 0.0 else math.inf,
+        scale_relative_sigma=noise * inflation / arm if arm > 0.0 else math.inf,
     )
 
 
@@ -227,7 +228,7 @@ def fit_spatial(model: NDArray[np.float64], target_m: NDArray[np.float64], *, se
     scale = float(np.cbrt(np.linalg.det(best[:, :3])))
     centered = scale * (model[inliers] - model[inliers].mean(axis=0))
     noise = float(np.sqrt((errors[inliers] ** 2).sum() / max(3 * int(inliers.sum()) - 7, 1)))
-    noise = max(noise, _MIN_SIGMA_M) * correlation_inflation(errors[inliers])
+    noise = max(noise, _MIN_SIGMA_M) * correlation_inflation(errors[inliers], 7 / 3)
     extents = np.linalg.svd(centered, compute_uv=False)
     return SpatialFit(
         scale=scale,
@@ -262,25 +263,33 @@ def robust_line_sigma(columns: NDArray[np.float64], values: NDArray[np.float64])
     inliers: NDArray[np.bool_] = np.abs(residuals) <= _INLIER_SIGMAS * sigma
     freedom = max(int(inliers.sum()) - design.shape[1], 1)
     noise = float(np.sqrt((residuals[inliers] ** 2).sum() / freedom))
-    return inliers, noise * correlation_inflation(residuals[inliers])
+    return inliers, noise * correlation_inflation(residuals[inliers], design.shape[1])
 
 
-def correlation_inflation(residuals: NDArray[np.float64] | NDArray[np.complex128]) -> float:
-    """How much larger the error of a mean is than that of as many independent residuals.
+def correlation_inflation(
+    residuals: NDArray[np.float64] | NDArray[np.complex128], parameters_per_coordinate: float
+) -> float:
+    """How much larger the error of what was fitted is than with as many independent residuals.
 
-    GPS errors drift slowly, so neighbours in time share much of theirs: sqrt((1 + rho) / (1 - rho)) for the lag-1
-    autocorrelation rho.
+    GPS errors drift slowly, so neighbours in time share much of theirs: of n residuals as many as
+    n_eff = n (1 - rho) / (1 + rho) are independent, for the lag-1 autocorrelation rho, and what the fit has taken up of
+    a drift is not among them. So with p parameters sqrt((n - p) / (n_eff - p)). The rho of few residuals is too small
+    by about (1 + 4 rho) / n (Kendall 1954).
 
     Args:
         residuals: (F,) or (F, D), in order of time, mean near 0.
+        parameters_per_coordinate: p, of those fitted.
     """
     values = residuals.reshape(len(residuals), -1)
     power = float((np.abs(values) ** 2).sum())
     if power == 0.0:
         return 1.0
     product = float(np.real(values[:-1] * np.conj(values[1:])).sum())
-    rho = min(max(product / power, 0.0), _MAX_AUTOCORRELATION)
-    return float(np.sqrt((1.0 + rho) / (1.0 - rho)))
+    rho = product / power
+    rho = min(max(rho + (1.0 + 4.0 * rho) / len(values), 0.0), 1.0)
+    independent = len(values) * (1.0 - rho) / (1.0 + rho)
+    freedom = max(len(values) - parameters_per_coordinate, _MIN_FREEDOM)
+    return math.sqrt(freedom / min(freedom, max(independent - parameters_per_coordinate, _MIN_FREEDOM)))
 
 
 def _scored_rows(count: int, rng: np.random.Generator) -> NDArray[np.int64]:
