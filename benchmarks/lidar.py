@@ -3,9 +3,14 @@
     python -m benchmarks.lidar WORKSPACE CLOUD.ply POSITIONS.json LIDAR.npz
 
 POSITIONS holds `{image name: [x, y, z]}` of true camera positions, LIDAR an array `xyz` (N, 3), both in one metric
-frame. The cloud is moved there by the rigid motion, and the similarity, that fit the cameras best. LiDAR scans are
-sparse and see less than the cameras. Accuracy counts only those points of the cloud that lie within 50 cm of a LiDAR
-point, and their share is printed; completeness counts LiDAR points within a range of the cameras.
+frame, and for several scans an array `scan` (N,) with the number of each point's. The cloud is moved there by the rigid
+motion, and the similarity, that fit the cameras best. After the rigid one each scan is also moved onto the cloud by
+itself, which leaves the errors of stereo and of scale: not how the poses drift, nor how badly a GPS placed the scans
+beside each other.
+
+LiDAR scans are sparse and see less than the cameras. Accuracy counts those points of the cloud that lie within 50 cm of
+a LiDAR point where the scan samples a plane, and is the distance from that; their share is printed. Completeness counts
+LiDAR points within a range of the cameras.
 """
 
 from __future__ import annotations
@@ -19,17 +24,18 @@ from numpy.typing import NDArray
 
 from app.scene.read_model import read_posed_scene
 from benchmarks.alignment import fit_rigid, fit_similarity, moved, position_errors
+from benchmarks.lidar_scan import fit_scan, surface_distances
 from benchmarks.machine import describe_machine
 from fusion.cloud import PointCloud, read_ply
 from fusion.compare import cloud_distances
 from fusion.thinning import thin
 
-_NEAR_LIDAR_M = 0.5
+_VOXEL_M = 0.05
 _THRESHOLDS_M = (0.05, 0.1, 0.2, 0.5)
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("workspace", type=Path)
     parser.add_argument("cloud", type=Path)
@@ -43,26 +49,47 @@ def main() -> None:
     known = np.array([name in truth for name in scene.image_names])
     expected = np.array([truth[name] for name in scene.image_names if name in truth])
     print(f"registered images   {len(scene.image_names)} of {len(truth)}")
-    cloud = read_ply(arguments.cloud)
-    scans = thin(PointCloud(np.load(arguments.lidar)["xyz"].astype(np.float32)), 0.05).points
-    scans = scans[cloud_distances(scans, expected.astype(np.float32)) <= arguments.range_m]
+    found = read_ply(arguments.cloud)
+    scans = _scans(arguments.lidar, expected.astype(np.float32), arguments.range_m)
     for name, fit in (("rigid fit", fit_rigid), ("similarity fit", fit_similarity)):
         motion = fit(scene.centers_in_world[known], expected)
         errors = 100 * position_errors(scene.centers_in_world[known], expected, motion)
         print(f"\n{name}: position error median {np.median(errors):.1f} cm, 95 % {np.percentile(errors, 95):.1f} cm")
-        _score(thin(moved(cloud, motion), 0.05).points, scans)
+        cloud = thin(moved(found, motion), _VOXEL_M).points
+        _print_scores(cloud, scans)
+        if fit is fit_rigid:
+            print("\neach scan moved onto the cloud after the rigid fit")
+            _print_scores(cloud, [_moved_scan(scan, cloud) for scan in scans])
 
 
-def _score(cloud: NDArray[np.float32], scans: NDArray[np.float32]) -> None:
-    to_lidar, to_cloud = cloud_distances(cloud, scans), cloud_distances(scans, cloud)
-    near = to_lidar <= _NEAR_LIDAR_M
-    print(f"points in 5 cm voxels: cloud {len(cloud):,}, LiDAR {len(scans):,}")
-    print(
-        f"of the cloud within {_NEAR_LIDAR_M:g} m of LiDAR {100 * near.mean():.1f} %; their median distance "
-        f"{100 * np.median(to_lidar[near]):.1f} cm"
-    )
+def _scans(file: Path, positions: NDArray[np.float32], range_m: float) -> list[NDArray[np.float32]]:
+    """Each scan's points within a range of the cameras, thinned."""
+    with np.load(file) as arrays:
+        points = arrays["xyz"].astype(np.float32)
+        numbers = arrays["scan"] if "scan" in arrays else np.zeros(len(points), dtype=np.int64)
+    scans = [thin(PointCloud(points[numbers == number]), _VOXEL_M).points for number in np.unique(numbers)]
+    return [scan[cloud_distances(scan, positions) <= range_m] for scan in scans]
+
+
+def _moved_scan(scan: NDArray[np.float32], cloud: NDArray[np.float32]) -> NDArray[np.float32]:
+    rotation, translation = fit_scan(scan, cloud)
+    found = (scan @ rotation.T + translation).astype(np.float32)
+    angle = np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))
+    shift = np.linalg.norm(found.mean(axis=0) - scan.mean(axis=0))
+    print(f"  a scan of {len(scan):,} points by {100 * shift:.0f} cm and {angle:.2f} degrees")
+    return found
+
+
+def _print_scores(cloud: NDArray[np.float32], scans: list[NDArray[np.float32]]) -> None:
+    """Of all pairs of a scan and a point of the cloud near it, and of all points of the scans."""
+    from_surface = np.stack([surface_distances(cloud, scan) for scan in scans])
+    to_cloud = np.concatenate([cloud_distances(scan, cloud) for scan in scans])
+    judged = from_surface[np.isfinite(from_surface)]
+    share = np.isfinite(from_surface).any(axis=0).mean()
+    print(f"points in 5 cm voxels: cloud {len(cloud):,}, LiDAR {len(to_cloud):,}")
+    print(f"of the cloud {100 * share:.1f} % near a plane of LiDAR; median {100 * np.median(judged):.1f} cm")
     print("within               " + "".join(f"{100 * t:>8g} cm" for t in _THRESHOLDS_M))
-    print("accuracy             " + "".join(f"{100 * (to_lidar[near] <= t).mean():>9.1f} %" for t in _THRESHOLDS_M))
+    print("accuracy             " + "".join(f"{100 * (judged <= t).mean():>9.1f} %" for t in _THRESHOLDS_M))
     print("completeness         " + "".join(f"{100 * (to_cloud <= t).mean():>9.1f} %" for t in _THRESHOLDS_M))
 
 
