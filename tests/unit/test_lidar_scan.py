@@ -33,7 +33,7 @@ def test_a_single_ring_and_a_bush_are_no_surface() -> None:
     along = np.arange(0, 6, 0.05, dtype=np.float32)
     ring = np.stack((along, 0 * along, 0 * along), axis=1)
     assert np.isnan(surface_distances(points, ring)).all()
-    bush = np.random.default_rng(0).uniform(-0.3, 0.3, (400, 3)).astype(np.float32) + points
+    bush = np.random.default_rng(0).uniform(-0.5, 0.5, (300, 3)).astype(np.float32) + points
     assert np.isnan(surface_distances(points, bush)).all()
 
 
