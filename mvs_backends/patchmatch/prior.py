@@ -8,15 +8,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mvs_backends.patchmatch.geometry import LevelCamera, warp
+
 # Grey values per pixel, of 255.
 _MAX_GRADIENT = 3.0
-_MIN_REGION_PX = 80
-_MIN_POINTS = 30
+_MIN_REGION_PX = 40
+_MIN_POINTS = 20
 _MAX_SCORED_POINTS = 2000
+_MAX_POINTS_OF_VIEW = 500_000
 _NUM_TRIALS, _NUM_REFINEMENTS = 60, 3
 _MIN_DETERMINANT = 1e-3
 _MAX_PLANES = 3
-# Of a region's credible pixels.
+# Of a region's credible points.
 _MIN_SHARE_FIRST, _MIN_SHARE_OTHER = 0.4, 0.15
 # A point lies on a plane, and a plane is known at a pixel, to the smaller of the two.
 _MAX_ERROR_PX, _MAX_RELATIVE_ERROR = 3.0, 0.025
@@ -39,7 +42,7 @@ def interpolated_planes(
         (height, width, 3) inverse depth and its slopes along x and y; 0 outside the points' convex hull.
     """
     planes = np.zeros((height, width, 3), np.float32)
-    cells = np.floor(points + 0.5).astype(np.int64)
+    cells = _cells(points)
     inside = np.all((cells >= 0) & (cells < [width, height]), axis=1)
     cells, inverse_depths = cells[inside], inverse_depths[inside]
     # One point per pixel, the nearest to the camera; also what finds a triangle's corners again.
@@ -90,56 +93,88 @@ def even_regions(grey: NDArray[np.uint8]) -> tuple[NDArray[np.int32], list[tuple
     return number[label], boxes
 
 
+def points_in_image(
+    plane: NDArray[np.float32], chosen: NDArray[np.bool_], source: LevelCamera, camera: LevelCamera
+) -> NDArray[np.float32]:
+    """Points of a source view's map in the image of another, or of the same at another size.
+
+    Args:
+        plane: (H, W, 3) the source view's plane hypotheses.
+        chosen: (H, W) pixels that are wanted; of very many, evenly spread ones.
+        source: the source view.
+        camera: the other.
+
+    Returns:
+        (P, 3) columns, rows and inverse depths of the points that project into the image.
+    """
+    rows, columns = np.nonzero(chosen)
+    step = 1 + len(rows) // _MAX_POINTS_OF_VIEW
+    rows, columns = rows[::step], columns[::step]
+    w = plane[rows, columns, 0]
+    to_image = warp(camera, source)
+    pixels = np.stack([columns, rows, np.ones_like(rows)], axis=1).astype(np.float32)
+    x, y, z = (pixels @ to_image[:9].reshape(3, 3).T + np.outer(w, to_image[9:])).T
+    before = z > 0
+    points = np.stack([x[before], y[before], w[before]], axis=1) / z[before, None]
+    cells = _cells(points)
+    inside: NDArray[np.float32] = points[np.all((cells >= 0) & (cells < [camera.width, camera.height]), axis=1)]
+    return inside
+
+
+def _cells(points: NDArray[np.float32] | NDArray[np.float64]) -> NDArray[np.int64]:
+    """(P, 2) column and row of the pixel that each point lies in."""
+    return np.floor(points[:, :2].astype(np.float64) + 0.5).astype(np.int64)
+
+
 def region_planes(
     regions: NDArray[np.int32],
     boxes: Sequence[tuple[slice, slice]],
-    inverse_depth: NDArray[np.float32],
-    credible: NDArray[np.bool_],
+    points: NDArray[np.float32],
     rate: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """Planes of evenly coloured regions, from their credible pixels.
+    """Planes of evenly coloured regions, from the credible points of this view and others.
 
     ACMP (Xu & Tao 2020) takes the triangles between credible pixels for planes. Those are as steep as two neighbours'
-    errors make them, and span what doesn't belong together; here each region gets the planes that most of its credible
-    pixels agree on, found by random sampling, as TAPA-MVS (Romanoni & Matteucci 2019) does for superpixels. A plane
-    reaches as far as its own points determine it.
+    errors make them, and span what doesn't belong together; here each region gets the planes that most of its points
+    agree on, found by random sampling, as TAPA-MVS (Romanoni & Matteucci 2019) does for superpixels. A plane reaches as
+    far as its own points determine it. As views share their points, their planes agree.
 
     Args:
         regions: (H, W) and
         boxes: as `even_regions` returns them.
-        inverse_depth: (H, W)
-        credible: (H, W) pixels whose depth is to be relied upon.
-        rate: (H, W) pixels in a source view per unit of inverse depth.
+        points: (P, 3) columns, rows and inverse depths of points in the image, within half a pixel of its borders.
+        rate: (P,) pixels in a source view per unit of inverse depth.
 
     Returns:
         (H, W, 3) inverse depth and its slopes along x and y; 0 where no plane is known.
     """
     planes = np.zeros((*regions.shape, 3), np.float32)
-    num_credible = np.bincount(regions[credible & (regions >= 0)], minlength=len(boxes))
+    columns, rows = _cells(points).T
+    region_of_point = regions[rows, columns]
+    order = np.argsort(region_of_point, kind="stable")
+    starts = np.searchsorted(region_of_point[order], np.arange(len(boxes) + 1))
     generator = np.random.default_rng(0)
-    for region in np.flatnonzero(num_credible >= _MIN_POINTS).tolist():
+    for region in np.flatnonzero(np.diff(starts) >= _MIN_POINTS).tolist():
         box = boxes[region]
-        member = regions[box] == region
-        _fit_region(
-            member, credible[box] & member, inverse_depth[box].astype(np.float64), rate[box], planes[box], generator
-        )
+        own = order[starts[region] : starts[region + 1]]
+        inside = points[own].astype(np.float64) - [box[1].start, box[0].start, 0]
+        _fit_region(regions[box] == region, inside, rate[own], planes[box], generator)
     return planes
 
 
 def _fit_region(
     member: NDArray[np.bool_],
-    credible: NDArray[np.bool_],
-    inverse_depth: NDArray[np.float64],
+    points_in_box: NDArray[np.float64],
     rate: NDArray[np.float32],
     planes: NDArray[np.float32],
     generator: np.random.Generator,
 ) -> None:
     """Write the planes of one region; where it has several, each pixel's is that of the nearest point."""
-    rows, columns = np.nonzero(credible)
-    points = np.stack([np.ones(len(rows)), columns / 100, rows / 100], axis=1)
-    w = inverse_depth[rows, columns]
+    columns, rows = _cells(points_in_box).T
+    points = np.stack([np.ones(len(rows)), points_in_box[:, 0] / 100, points_in_box[:, 1] / 100], axis=1)
+    w = points_in_box[:, 2]
     # Two pixels are much where parallax is little: far away almost anything would lie on one plane.
-    rate = np.maximum(rate[rows, columns], _MAX_ERROR_PX / (_MAX_RELATIVE_ERROR * w))
+    rate = np.maximum(rate, _MAX_ERROR_PX / (_MAX_RELATIVE_ERROR * w))
     remaining = np.arange(len(points))
     found, distances = [], []
     for number in range(_MAX_PLANES):

@@ -15,7 +15,7 @@ from mvs_backends.patchmatch.cost.kernels import PADDING, Reference, Sources, Wi
 from mvs_backends.patchmatch.geometry import LevelCamera, level_camera, warp
 from mvs_backends.patchmatch.images import ImageCache
 from mvs_backends.patchmatch.kernels import Search, State, initialise_rows, sweep_rows
-from mvs_backends.patchmatch.maps.kernels import credible_rows, smooth_rows, upsample
+from mvs_backends.patchmatch.maps.kernels import credible_rows, parallax_rates, smooth_rows, upsample
 from mvs_backends.patchmatch.options import PatchMatchOptions
 from mvs_backends.patchmatch.prior import even_regions, region_planes
 
@@ -217,31 +217,33 @@ class LevelSearch:
             pass
         return Hypotheses(plane=result, cost=found.cost, view=found.view)
 
-    def with_planes(self, found: Hypotheses) -> Hypotheses:
-        """Hypotheses with the planes of evenly coloured regions where they are not credible by themselves."""
-        grey = self.reference.padded_grey[PADDING:-PADDING, PADDING:-PADDING]
-        regions, boxes = even_regions(grey)
-        credible, rate = np.empty(grey.shape, np.bool_), np.empty(grey.shape, np.float32)
+    def credible(self, found: Hypotheses) -> NDArray[np.bool_]:
+        """(H, W) pixels of evenly coloured regions whose depth the source views' maps confirm."""
+        wanted = self._regions()[0] >= 0
+        result = np.zeros(wanted.shape, np.bool_)
+        max_cost = np.float32(self.options.max_prior_cost)
+        views = self.reference, self.sources, self.window
 
         def run(first_row: int) -> None:
-            last_row = min(first_row + _ROWS_PER_TASK, len(rate))
-            credible_rows(
-                first_row,
-                last_row,
-                regions >= 0,
-                found.plane,
-                np.float32(self.options.max_prior_cost),
-                self.reference,
-                self.sources,
-                self.window,
-                new_scratch(len(self.sources.width)),
-                credible,
-                rate,
-            )
+            last_row = min(first_row + _ROWS_PER_TASK, len(wanted))
+            scratch = new_scratch(len(self.sources.width))
+            credible_rows(first_row, last_row, wanted, found.plane, max_cost, *views, scratch, result)
 
-        for _ in self.executor.map(run, range(0, len(rate), _ROWS_PER_TASK)):
+        for _ in self.executor.map(run, range(0, len(wanted), _ROWS_PER_TASK)):
             pass
-        planes = region_planes(regions, boxes, found.plane[..., 0], credible, rate)
+        return result
+
+    def with_planes(self, found: Hypotheses, credible: NDArray[np.bool_], points: NDArray[np.float32]) -> Hypotheses:
+        """Hypotheses with the planes of evenly coloured regions where they are not credible by themselves.
+
+        Args:
+            found: what to change; it stays as it is.
+            credible: (H, W) pixels that keep their hypotheses.
+            points: (P, 3) credible points of this view and others, as of `region_planes`.
+        """
+        rate = np.empty(len(points), np.float32)
+        parallax_rates(points, self.sources, rate)
+        planes = region_planes(*self._regions(), points, rate)
         low, high = np.moveaxis(self.reference.inverse_range, -1, 0)
         taken = (planes[..., 0] > 0) & (planes[..., 0] >= low) & (planes[..., 0] <= high) & ~credible
         return Hypotheses(
@@ -249,6 +251,9 @@ class LevelSearch:
             cost=np.where(taken, np.minimum(found.cost, _PLANE_COST), found.cost),
             view=found.view,
         )
+
+    def _regions(self) -> tuple[NDArray[np.int32], list[tuple[slice, slice]]]:
+        return even_regions(self.reference.padded_grey[PADDING:-PADDING, PADDING:-PADDING])
 
 
 def upsampled(coarse: Hypotheses, coarse_grey: NDArray[np.uint8], reference: Reference) -> Hypotheses:

@@ -11,7 +11,7 @@ from mvs_backends.patchmatch import kernels as search
 from mvs_backends.patchmatch.averaging import averaged_planes
 from mvs_backends.patchmatch.cost import kernels as cost
 from mvs_backends.patchmatch.geometry import LevelCamera, depth_and_normal
-from mvs_backends.patchmatch.maps.kernels import credible_rows, smooth_rows, upsample
+from mvs_backends.patchmatch.maps.kernels import credible_rows, parallax_rates, smooth_rows, upsample
 from tests.reference import patchmatch as plain
 from tests.reference.stereo_scene import (
     HEIGHT,
@@ -114,25 +114,35 @@ def test_smoothing() -> None:
     np.testing.assert_allclose(found, plain.smoothed(plane.astype(float), rate, 2), atol=2e-4)
 
 
+def test_parallax_rates() -> None:
+    made = scene(2)
+    rng = np.random.default_rng(11)
+    points = np.stack([rng.uniform(0, WIDTH, 50), rng.uniform(0, HEIGHT, 50), rng.uniform(0.15, 0.25, 50)], axis=1)
+    found = np.empty(50, np.float32)
+    parallax_rates(points.astype(np.float32), made.kernel_sources, found)
+    expected = [
+        max(plain.px_per_inverse_depth(made.reference, source, *point) for source in made.sources) for point in points
+    ]
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
+
+
 def test_credible_pixels() -> None:
     made, wall = wall_scene(3)
     rng = np.random.default_rng(10)
     plane = (wall * rng.normal(1, 0.004, (HEIGHT, WIDTH, 1))).astype(np.float32)
     wanted = np.zeros((HEIGHT, WIDTH), np.bool_)
     wanted[4:-4, 4:-4] = rng.random((HEIGHT - 8, WIDTH - 8)) < 0.5
-    credible, rate = np.empty((HEIGHT, WIDTH), np.bool_), np.empty((HEIGHT, WIDTH), np.float32)
+    credible = np.empty((HEIGHT, WIDTH), np.bool_)
     max_cost, scratch = 0.15, cost.new_scratch(NUM_SOURCES)
     views = made.kernel_reference, made.kernel_sources, WINDOW, scratch
-    credible_rows(0, HEIGHT, wanted, plane, np.float32(max_cost), *views, credible, rate)
-    expected, rates = np.zeros_like(credible), np.zeros(credible.shape)
+    credible_rows(0, HEIGHT, wanted, plane, np.float32(max_cost), *views, credible)
+    expected = np.zeros_like(credible)
     for y, x in np.argwhere(wanted):
         here = plane[y, x].astype(float)
         if plain.patch_variance(made.reference.grey, x, y, SIGMAS) < 2:
             continue
         confirming = plain.num_confirming(made.reference, made.sources, made.maps, x, y, here, max_cost, SIGMAS)
         expected[y, x] = confirming >= 2
-        rates[y, x] = max(plain.px_per_inverse_depth(made.reference, source, x, y, here[0]) for source in made.sources)
-    np.testing.assert_allclose(rate, rates, rtol=1e-3)
     np.testing.assert_array_equal(credible, expected)
     assert 30 < expected.sum() < wanted.sum() / 2
 

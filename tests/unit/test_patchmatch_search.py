@@ -37,6 +37,7 @@ TWINS = {
     "upsample": patchmatch.upsampled,
     "smooth_rows": patchmatch.smoothed,
     "credible_rows": patchmatch.num_confirming,
+    "parallax_rates": patchmatch.px_per_inverse_depth,
     "add_agreeing_rows": patchmatch.averaged,
     "random_bits": patchmatch.random_bits,
     "_gather_candidates": patchmatch.candidate_planes,

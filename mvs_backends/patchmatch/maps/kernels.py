@@ -111,17 +111,16 @@ def smooth_rows(first_row, last_row, radius, plane, reference, sources, out):
 
 
 @njit(cache=True, **COMPILED)
-def credible_rows(first_row, last_row, wanted, plane, max_cost, reference, sources, window, scratch, credible, rate):
+def credible_rows(first_row, last_row, wanted, plane, max_cost, reference, sources, window, scratch, credible):
     """Find the wanted pixels that two source views confirm, in a band of rows.
 
     A view confirms a hypothesis that costs at most `max_cost` there, and 0.1 more if moved by 2 pixels either way (on a
     smooth shade or along an edge it costs little everywhere), if the view's own map reprojects to within a pixel of it.
-    `rate` gets the pixels per inverse depth in the view where they are most.
     """
     for y in range(first_row, last_row):
         for x in range(plane.shape[1]):
             w, a, b = plane[y, x, 0], plane[y, x, 1], plane[y, x, 2]
-            credible[y, x], rate[y, x] = False, _ZERO
+            credible[y, x] = False
             if w <= _ZERO or not wanted[y, x]:
                 continue
             variance = sample_reference(reference.padded_grey, x, y, window, scratch.weight, scratch.centred)
@@ -129,19 +128,27 @@ def credible_rows(first_row, last_row, wanted, plane, max_cost, reference, sourc
                 continue
             confirming = 0
             for j in range(sources.warp.shape[0]):
-                moves = px_per_inverse_depth(j, x, y, w, sources.warp)
-                rate[y, x] = max(rate[y, x], moves)
                 if geometric_error(j, x, y, w, sources, _TWO) > _MAX_GEOMETRIC_TERM:
                     continue
                 cost = view_cost(j, x, y, w, a, b, variance, sources, window, scratch)
                 if cost > max_cost:
                     continue
-                step = _DISTINCT_STEP_PX / max(moves, _TINY)
+                step = _DISTINCT_STEP_PX / max(px_per_inverse_depth(j, x, y, w, sources.warp), _TINY)
                 nearer = view_cost(j, x, y, w + step, a, b, variance, sources, window, scratch)
                 farther = view_cost(j, x, y, w - step, a, b, variance, sources, window, scratch)
                 if min(nearer, farther) > cost + _DISTINCT_COST:
                     confirming += 1
             credible[y, x] = confirming >= _MIN_CONFIRMING
+
+
+@njit(cache=True, **COMPILED)
+def parallax_rates(points, sources, rates):
+    """Pixels per inverse depth of points (column, row, inverse depth) in the source view where they are most."""
+    for i in range(len(points)):
+        rates[i] = _ZERO
+        for j in range(sources.warp.shape[0]):
+            rate = px_per_inverse_depth(j, points[i, 0], points[i, 1], points[i, 2], sources.warp)
+            rates[i] = max(rates[i], rate)
 
 
 @njit(cache=True, **COMPILED)

@@ -1,0 +1,256 @@
+"""The passes over the views of a cluster; what each finds is kept in files until all are done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mvs_backends.base import MvsJob
+from mvs_backends.colmap_maps import has_maps, write_maps
+from mvs_backends.masks import read_mask
+from mvs_backends.patchmatch.averaging import averaged_planes
+from mvs_backends.patchmatch.cost.kernels import PADDING, Reference
+from mvs_backends.patchmatch.geometry import LevelCamera, depth_and_normal, level_camera
+from mvs_backends.patchmatch.images import ImageCache
+from mvs_backends.patchmatch.options import PatchMatchOptions
+from mvs_backends.patchmatch.prior import interpolated_planes, points_in_image
+from mvs_backends.patchmatch.search import (
+    Hypotheses,
+    LevelSearch,
+    gather_sources,
+    inverse_range,
+    sparse_points_in_image,
+    upsampled,
+    window,
+)
+
+Arrays = dict[str, NDArray[Any]]
+_FINISHED = "finished"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pass:
+    """One pass over all views."""
+
+    share: float
+    """Of the time of all passes, roughly."""
+    is_done: Callable[[int], bool]
+    """Whether the result for a view is there."""
+    run: Callable[[int], None]
+    """Leave the result for a view."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Passes:
+    """All passes of a job. Each reads what earlier ones left for all views, so the order of views doesn't matter."""
+
+    job: MvsJob
+    options: PatchMatchOptions
+    seed: int
+    images: ImageCache
+    folder: Path
+    """Where results are kept."""
+    executor: Executor
+
+    def in_order(self) -> Sequence[Pass]:
+        """What there is to do, one after the other.
+
+        Coarse to fine, each level is searched, then (for the planar prior) its credible pixels are found, which needs
+        the maps of all views; the finest level's maps get planes and are smoothed, and at last averaged and written.
+        """
+        sweeps = [count / 4.0 ** self._level(number) for number, count in enumerate(self.options.iterations)]
+        passes = []
+        for number, cost in enumerate(sweeps):
+            passes.append(self._kept_pass(_searched(number), cost, partial(self._search, number)))
+            if self.options.planar_prior:
+                passes.append(self._kept_pass(_credible(number), cost / 10, partial(self._find_credible, number)))
+        passes.append(self._kept_pass(_FINISHED, sweeps[-1] / 10, self._finish))
+        passes.append(Pass(share=sweeps[-1] / 10, is_done=partial(has_maps, self.job), run=self._write))
+        total = sum(part.share for part in passes)
+        return [replace(part, share=part.share / total) for part in passes]
+
+    def _kept_pass(self, name: str, share: float, find: Callable[[int], Arrays]) -> Pass:
+        def run(view: int) -> None:
+            path = self._file(name, view)
+            partly = path.with_name(f".{path.stem}.partial.npz")
+            np.savez(partly, allow_pickle=False, **find(view))
+            partly.replace(path)
+
+        return Pass(share=share, is_done=lambda view: self._file(name, view).exists(), run=run)
+
+    def _search(self, number: int, view: int) -> Arrays:
+        """Hypotheses of a level, from random ones or from those of the level before."""
+        level = self._level(number)
+        with_maps = number > 0 and self.options.geometric_weight > 0
+        search = self._level_search(view, level, number, maps_of=number - 1 if with_maps else None)
+        camera = level_camera(self.job.views[view], level)
+        if search is None:
+            return _arrays(_nothing(camera))
+        if number == 0:
+            points, inverse_depths = sparse_points_in_image(self.job, view, camera)
+            start = search.start(interpolated_planes(points, inverse_depths, camera.width, camera.height))
+        else:
+            coarse_grey, _ = self.images.get(view, self._level(number - 1))
+            start = upsampled(self._hypotheses(_searched(number - 1), view), coarse_grey, search.reference)
+            if self.options.planar_prior:
+                start = self._with_planes(search, start, view, camera, number - 1)
+        return _arrays(search.sweep(start, self.options.iterations[number], random_depth=number == 0))
+
+    def _find_credible(self, number: int, view: int) -> Arrays:
+        """Pixels whose depth is to be relied upon."""
+        search = self._level_search(view, self._level(number), number, maps_of=number)
+        found = self._hypotheses(_searched(number), view)
+        credible = search.credible(found) if search else np.zeros(found.cost.shape, np.bool_)
+        return {"credible": credible}
+
+    def _finish(self, view: int) -> Arrays:
+        """The finest level's hypotheses with planes, smoothed, those of high cost removed."""
+        last = len(self.options.iterations) - 1
+        level = self._level(last)
+        search = self._level_search(view, level, last, maps_of=None)
+        found = self._hypotheses(_searched(last), view)
+        if search is None:
+            return _arrays(found)
+        if self.options.planar_prior:
+            found = self._with_planes(search, found, view, level_camera(self.job.views[view], level), last)
+        if self.options.smoothing_radius_px > 0:
+            found = search.smoothed(found, self.options.smoothing_radius_px)
+        found.plane[~(found.cost <= self.options.max_cost)] = 0.0
+        return _arrays(found)
+
+    def _write(self, view: int) -> None:
+        """Leave the maps of a view, averaged with those of the other views, as COLMAP's."""
+        options, level = self.options, self.options.finest_level
+        found = self._hypotheses(_FINISHED, view)
+        if options.average_views:
+            others = [
+                (level_camera(self.job.views[other], level), partial(self._kept, _FINISHED, other, "plane"))
+                for other in sorted(self.job.sources[view])
+            ]
+            plane = averaged_planes(found.plane, level_camera(self.job.views[view], level), others, self.executor)
+            limits = self._reference(view, level).inverse_range
+            known = plane[..., 0] > 0
+            plane[known, 0] = np.clip(plane[known, 0], limits[known, 0], limits[known, 1])
+            found = replace(found, plane=plane)
+        if level > 0:
+            found = upsampled(found, self.images.get(view, level)[0], self._reference(view, 0))
+        plane = np.where((found.cost <= options.max_cost)[..., None], found.plane, np.float32(0))
+        plane[_speckles(plane[..., 0], options.min_speckle_px)] = 0.0
+        depth, normal = depth_and_normal(plane, level_camera(self.job.views[view], 0).calibration)
+        write_maps(self.job, view, depth, normal)
+
+    def _with_planes(
+        self, search: LevelSearch, found: Hypotheses, view: int, camera: LevelCamera, number: int
+    ) -> Hypotheses:
+        """Hypotheses with planes through the credible points that a level's search found in the view and in others.
+
+        Args:
+            search: at the level of
+            found: what to change.
+            view: the reference view and
+            camera: its camera at that level.
+            number: of the search that the credible points are from.
+        """
+        points = [
+            points_in_image(
+                self._kept(_searched(number), other, "plane"),
+                self._kept(_credible(number), other, "credible"),
+                level_camera(self.job.views[other], self._level(number)),
+                camera,
+            )
+            for other in (view, *sorted(self.job.sources[view]))
+        ]
+        credible = self._kept(_credible(number), view, "credible").astype(np.uint8)
+        size = camera.width, camera.height
+        here = cv2.resize(credible, size, interpolation=cv2.INTER_NEAREST).astype(np.bool_)
+        return search.with_planes(found, here, np.concatenate(points))
+
+    def _level_search(self, view: int, level: int, number: int, maps_of: int | None) -> LevelSearch | None:
+        """The search of a view at a level with the maps of an earlier pass; None if there is nothing to search."""
+        reference, sources = self._reference(view, level), self._sources(view)
+        if not sources or not (reference.inverse_range[..., 1] > 0).any():
+            return None
+
+        def maps(source: int) -> tuple[NDArray[np.float32], int]:
+            assert maps_of is not None
+            return self._kept(_searched(maps_of), source, "plane"), self._level(maps_of)
+
+        return LevelSearch(
+            reference=reference,
+            sources=gather_sources(self.job, view, sources, level, self.images, maps if maps_of is not None else None),
+            window=window(self.options),
+            options=self.options,
+            seed=self.seed + 1000003 * view + 7919 * number,
+            executor=self.executor,
+        )
+
+    def _sources(self, view: int) -> list[int]:
+        # By index: nothing depends on the order in which a job names them.
+        return sorted(self.job.sources[view][: self.options.num_source_views])
+
+    def _reference(self, view: int, level: int) -> Reference:
+        camera = level_camera(self.job.views[view], level)
+        grey, _ = self.images.get(view, level)
+        mask = read_mask(self.job, view, camera.width, camera.height)
+        calibration = camera.calibration
+        return Reference(
+            padded_grey=np.pad(grey, PADDING, mode="edge"),
+            inverse_range=inverse_range(self.job, view, camera, mask),
+            intrinsics=np.array(
+                [calibration[0, 0], calibration[1, 1], calibration[0, 2], calibration[1, 2]], np.float32
+            ),
+        )
+
+    def _level(self, number: int) -> int:
+        return self.options.finest_level + len(self.options.iterations) - 1 - number
+
+    def _file(self, name: str, view: int) -> Path:
+        return self.folder / f"{name}_view{view:05d}.npz"
+
+    def _kept(self, name: str, view: int, field: str) -> NDArray[Any]:
+        with np.load(self._file(name, view)) as data:
+            kept: NDArray[Any] = data[field]
+        return kept
+
+    def _hypotheses(self, name: str, view: int) -> Hypotheses:
+        with np.load(self._file(name, view)) as data:
+            return Hypotheses(plane=data["plane"], cost=data["cost"], view=data["view"])
+
+
+def _searched(number: int) -> str:
+    return f"pass{number}"
+
+
+def _credible(number: int) -> str:
+    return f"credible{number}"
+
+
+def _arrays(found: Hypotheses) -> Arrays:
+    return {"plane": found.plane, "cost": found.cost, "view": found.view}
+
+
+def _nothing(camera: LevelCamera) -> Hypotheses:
+    shape = camera.height, camera.width
+    return Hypotheses(
+        plane=np.zeros((*shape, 3), np.float32), cost=np.full(shape, 2, np.float32), view=np.full(shape, -1, np.int8)
+    )
+
+
+def _speckles(inverse_depth: NDArray[np.float32], min_speckle_px: int) -> NDArray[np.bool_]:
+    """Pixels of connected pieces of fewer pixels, where neighbours of like depth (2 %) connect."""
+    known = inverse_depth > 0
+    steps = np.zeros(inverse_depth.shape, np.int16)
+    if known.any():
+        logs = np.log(inverse_depth[known])
+        steps[known] = 1 + np.minimum((logs - logs.min()) / 0.002, 32000).astype(np.int16)
+    cv2.filterSpeckles(steps, 0, min_speckle_px - 1, 10)
+    removed: NDArray[np.bool_] = known & (steps == 0)
+    return removed
