@@ -26,24 +26,25 @@ def depth_range(
         several boxes they are the first entry and the last exit. The entry is 0 for a camera inside a box.
     """
     columns = (np.arange(width) + 0.5) * (view.width / width)
-    rows = (np.arange(height) + 0.5) * (view.height / height)
-    pixels = np.stack([*np.meshgrid(columns, rows), np.ones((height, width))], axis=-1)
+    rows = (np.arange(height)[:, None] + 0.5) * (view.height / height)
     rotation, translation = view.cam_from_world[:, :3], view.cam_from_world[:, 3]
     # Scaled so that the ray parameter is camera z.
-    rays = pixels @ (np.linalg.inv(view.calibration).T @ rotation)
+    ray_from_pixel = rotation.T @ np.linalg.inv(view.calibration)
     center = -rotation.T @ translation
     entry = np.full((height, width), np.inf)
     leave = np.zeros((height, width))
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1.0 / rays
-        for low, high in boxes_in_world:
-            first, second = (low - center) * inverse, (high - center) * inverse
-            # A ray within a slab's face gives 0 * inf = NaN there, which fmin and fmax pass over.
-            near = np.fmax.reduce(np.fmin(first, second), axis=-1).clip(min=0.0)
-            far = np.fmin.reduce(np.fmax(first, second), axis=-1)
+        inverse = [1.0 / (along_x * columns + (along_y * rows + rest)) for along_x, along_y, rest in ray_from_pixel]
+        for box in boxes_in_world:
+            near, far = np.zeros((height, width)), np.full((height, width), np.inf)
+            for (low, high), per_depth in zip((box - center).T, inverse, strict=True):
+                # A ray within a slab's face gives 0 * inf = NaN there, which fmin and fmax pass over.
+                first, second = low * per_depth, high * per_depth
+                np.fmax(near, np.fmin(first, second), out=near)
+                np.fmin(far, np.fmax(first, second), out=far)
             hit = far > near
-            entry = np.where(hit, np.minimum(entry, near), entry)
-            leave = np.where(hit, np.maximum(leave, far), leave)
+            np.minimum(entry, near, out=entry, where=hit)
+            np.maximum(leave, far, out=leave, where=hit)
     entry[leave <= 0] = 0.0
     return entry, leave
 

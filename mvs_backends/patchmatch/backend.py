@@ -7,9 +7,11 @@ import json
 import logging
 import shutil
 import tempfile
-import time
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 from mvs_backends.base import Availability, MvsBackend, MvsJob, MvsOptions, Progress
@@ -17,10 +19,12 @@ from mvs_backends.colmap_maps import has_maps
 from mvs_backends.patchmatch.images import ImageCache
 from mvs_backends.patchmatch.kernels import sweep_rows
 from mvs_backends.patchmatch.options import PatchMatchOptions, options_of_preset
-from mvs_backends.patchmatch.passes import Passes
+from mvs_backends.patchmatch.passes import Pass, Passes
 from mvs_backends.patchmatch.tiny_job import tiny_job
 
 logger = logging.getLogger(__name__)
+# Of a view that is worked on, beside the images kept; and of all that are worked on side by side.
+_BYTES_PER_PX, _MAX_VIEWS_BYTES = 200, 4_000_000_000
 
 
 class PatchMatch(MvsBackend):
@@ -63,38 +67,55 @@ def estimate_maps(
     Raises:
         MvsError: an image or mask can't be read.
     """
+    if not all(has_maps(job, view) for view in range(len(job.views))):
+        _make_maps(job, options, seed, num_threads, progress)
+    shutil.rmtree(_kept_folder(job), ignore_errors=True)
+
+
+def _make_maps(job: MvsJob, options: PatchMatchOptions, seed: int, num_threads: int, progress: Progress | None) -> None:
     num_views = len(job.views)
-    if all(has_maps(job, view) for view in range(num_views)):
-        return
-    folder = _kept_folder(job, options, seed)
-    with ThreadPoolExecutor(num_threads) as executor:
-        passes = Passes(
-            job=job, options=options, seed=seed, images=ImageCache(job), folder=folder, executor=executor
-        ).in_order()
+    folder = _prepare_folder(job, options, seed)
+    largest_px = max(view.width * view.height for view in job.views)
+    at_a_time = min(num_threads, max(1, _MAX_VIEWS_BYTES // (_BYTES_PER_PX * largest_px)))
+    with ThreadPoolExecutor(num_threads) as executor, _views_executor(at_a_time) as views_executor:
+        passes = Passes(job=job, options=options, seed=seed, images=ImageCache(job), folder=folder, executor=executor)
         before = 0.0
-        for number, part in enumerate(passes):
-            for view in range(num_views):
-                if not part.is_done(view):
-                    started = time.perf_counter()
-                    part.run(view)
-                    seconds = time.perf_counter() - started
-                    logger.debug("%s: pass %d of %d in %.1f s", job.views[view].name, number + 1, len(passes), seconds)
+        for part in passes.in_order():
+            for num_done, _ in enumerate(views_executor.map(partial(_run, part), range(num_views)), start=1):
                 if progress is not None:
-                    progress(int((before + part.share * (view + 1) / num_views) * num_views + 1e-6), num_views)
+                    progress(int((before + part.share * num_done / num_views) * num_views + 1e-6), num_views)
             before += part.share
-    shutil.rmtree(folder)
 
 
-def _kept_folder(job: MvsJob, options: PatchMatchOptions, seed: int) -> Path:
+@contextmanager
+def _views_executor(at_a_time: int) -> Iterator[Executor]:
+    """Runs views side by side, as parts of their work use one thread only; drops those not begun at an error."""
+    executor = ThreadPoolExecutor(at_a_time)
+    try:
+        yield executor
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+def _run(part: Pass, view: int) -> None:
+    if not part.is_done(view):
+        part.run(view)
+
+
+def _prepare_folder(job: MvsJob, options: PatchMatchOptions, seed: int) -> Path:
     """Where passes are kept; emptied if it holds those of another job or of other options."""
     digest = hashlib.sha256(job.boxes_in_world.tobytes() + job.points_in_world.tobytes())
     for view in job.views:
         digest.update(view.name.encode() + view.calibration.tobytes() + view.cam_from_world.tobytes())
     made_by = json.dumps([4, asdict(options), seed, job.sources, digest.hexdigest()], sort_keys=True)
-    folder = job.workspace / "stereo" / "patchmatch"
+    folder = _kept_folder(job)
     label = folder / "made_by.json"
     if folder.exists() and not (label.exists() and label.read_text() == made_by):
         shutil.rmtree(folder)
     folder.mkdir(parents=True, exist_ok=True)
     label.write_text(made_by)
     return folder
+
+
+def _kept_folder(job: MvsJob) -> Path:
+    return job.workspace / "stereo" / "patchmatch"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from threading import Lock
 
 import cv2
 import numpy as np
@@ -14,11 +15,12 @@ from mvs_backends.patchmatch.geometry import level_size
 
 
 class ImageCache:
-    """Grey images and their packed form, the least recently used ones let go."""
+    """Grey images and their packed form, the least recently used ones let go. Threads may share it."""
 
     def __init__(self, job: MvsJob, max_bytes: int = 1_000_000_000) -> None:
         self._job = job
         self._max_bytes = max_bytes
+        self._lock = Lock()
         self._kept: OrderedDict[tuple[int, int], tuple[NDArray[np.uint8], NDArray[np.uint32]]] = OrderedDict()
 
     def get(self, view: int, level: int) -> tuple[NDArray[np.uint8], NDArray[np.uint32]]:
@@ -28,18 +30,21 @@ class ImageCache:
             MvsError: the image can't be read, or has not the view's size.
         """
         key = (view, level)
-        if key in self._kept:
+        with self._lock:
+            if key not in self._kept:
+                self._kept[key] = self._made(view, level)
             self._kept.move_to_end(key)
+            while len(self._kept) > 1 and sum(a.nbytes + b.nbytes for a, b in self._kept.values()) > self._max_bytes:
+                self._kept.popitem(last=False)
             return self._kept[key]
+
+    def _made(self, view: int, level: int) -> tuple[NDArray[np.uint8], NDArray[np.uint32]]:
         grey = self._read(view)
         if level > 0:
             size = level_size(self._job.views[view], level)
             grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
         packed = np.empty(grey.size, np.uint32)
         pack_neighbours(grey, packed)
-        self._kept[key] = (grey, packed)
-        while len(self._kept) > 1 and sum(a.nbytes + b.nbytes for a, b in self._kept.values()) > self._max_bytes:
-            self._kept.popitem(last=False)
         return grey, packed
 
     def _read(self, view: int) -> NDArray[np.uint8]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -79,12 +80,15 @@ class Passes:
 
     def _kept_pass(self, name: str, share: float, find: Callable[[int], Arrays]) -> Pass:
         def run(view: int) -> None:
-            path = self._file(name, view)
-            partly = path.with_name(f".{path.stem}.partial.npz")
-            np.savez(partly, allow_pickle=False, **find(view))
-            partly.replace(path)
+            folder = self._kept_in(name, view)
+            partly = folder.with_name(f".{folder.name}.partial")
+            shutil.rmtree(partly, ignore_errors=True)
+            partly.mkdir()
+            for field, values in find(view).items():
+                np.save(partly / f"{field}.npy", values)
+            partly.replace(folder)
 
-        return Pass(share=share, is_done=lambda view: self._file(name, view).exists(), run=run)
+        return Pass(share=share, is_done=lambda view: self._kept_in(name, view).exists(), run=run)
 
     def _search(self, number: int, view: int) -> Arrays:
         """Hypotheses of a level, from random ones or from those of the level before."""
@@ -212,17 +216,16 @@ class Passes:
     def _level(self, number: int) -> int:
         return self.options.finest_level + len(self.options.iterations) - 1 - number
 
-    def _file(self, name: str, view: int) -> Path:
-        return self.folder / f"{name}_view{view:05d}.npz"
+    def _kept_in(self, name: str, view: int) -> Path:
+        return self.folder / f"{name}_view{view:05d}"
 
     def _kept(self, name: str, view: int, field: str) -> NDArray[Any]:
-        with np.load(self._file(name, view)) as data:
-            kept: NDArray[Any] = data[field]
+        kept: NDArray[Any] = np.load(self._kept_in(name, view) / f"{field}.npy")
         return kept
 
     def _hypotheses(self, name: str, view: int) -> Hypotheses:
-        with np.load(self._file(name, view)) as data:
-            return Hypotheses(plane=data["plane"], cost=data["cost"], view=data["view"])
+        plane, cost, best = (self._kept(name, view, field) for field in ("plane", "cost", "view"))
+        return Hypotheses(plane=plane, cost=cost, view=best)
 
 
 def _searched(number: int) -> str:

@@ -176,31 +176,28 @@ def _fit_region(
     # Two pixels are much where parallax is little: far away almost anything would lie on one plane.
     rate = np.maximum(rate, _MAX_ERROR_PX / (_MAX_RELATIVE_ERROR * w))
     remaining = np.arange(len(points))
-    found, distances = [], []
-    for number in range(_MAX_PLANES):
-        share = _MIN_SHARE_OTHER if number else _MIN_SHARE_FIRST
+    found: list[NDArray[np.int64]] = []
+    while len(found) < _MAX_PLANES and len(remaining) >= _MIN_POINTS:
+        share = _MIN_SHARE_OTHER if found else _MIN_SHARE_FIRST
         inliers = _largest_plane(points[remaining], w[remaining], rate[remaining], generator)
         if len(inliers) < max(_MIN_POINTS, share * len(points)):
             break
-        chosen = remaining[inliers]
+        found.append(remaining[inliers])
         remaining = np.delete(remaining, inliers)
-        found.append(chosen)
-        away = np.ones(member.shape, np.uint8)
-        away[rows[chosen], columns[chosen]] = 0
-        distances.append(cv2.distanceTransform(away, cv2.DIST_L2, 3))
-        if len(remaining) < _MIN_POINTS:
-            break
-    if not found:
-        return
-    nearest = np.argmin(distances, axis=0)
+    nearest = np.zeros(member.shape, np.int64)
+    if len(found) > 1:
+        away = np.ones((len(found), *member.shape), np.uint8)
+        for number, chosen in enumerate(found):
+            away[number, rows[chosen], columns[chosen]] = 0
+        nearest = np.argmin([cv2.distanceTransform(mask, cv2.DIST_L2, 3) for mask in away], axis=0)
     for number, chosen in enumerate(found):
         own = points[chosen]
-        plane = np.linalg.lstsq(own, w[chosen], rcond=None)[0]
+        plane = _least_squares(own, w[chosen])
         spread = np.std((own @ plane - w[chosen]) * rate[chosen])
-        covariance = np.linalg.inv(own.T @ own) * spread**2 * _CORRELATED_PX
+        covariance = np.linalg.pinv(own.T @ own) * spread**2 * _CORRELATED_PX
         y, x = np.nonzero(member & (nearest == number))
         there = np.stack([np.ones(len(x)), x / 100, y / 100], axis=1)
-        known = np.einsum("pi,ij,pj->p", there, covariance, there) < _MAX_ERROR_PX**2
+        known = np.sum(there @ covariance * there, axis=1) < _MAX_ERROR_PX**2
         y, x = y[known], x[known]
         planes[y, x, 0] = there[known] @ plane
         planes[y, x, 1:] = plane[1:] / 100
@@ -215,7 +212,7 @@ def _largest_plane(
     solvable = np.abs(np.linalg.det(corners)) > _MIN_DETERMINANT
     if not solvable.any():
         return np.zeros(0, np.int64)
-    trials = np.linalg.solve(corners[solvable], w[drawn[solvable], None])[..., 0]
+    trials = np.asarray(np.linalg.solve(corners[solvable], w[drawn[solvable], None])[..., 0], np.float64)
     scored = np.unique(np.linspace(0, len(points) - 1, _MAX_SCORED_POINTS).astype(np.int64))
     errors = np.abs(trials @ points[scored].T - w[scored]) * rate[scored]
     plane = trials[np.argmax((errors < _MAX_ERROR_PX).sum(axis=1))]
@@ -224,5 +221,9 @@ def _largest_plane(
         inliers = np.flatnonzero(np.abs(points @ plane - w) * rate < _MAX_ERROR_PX)
         if len(inliers) < _MIN_POINTS:
             break
-        plane = np.linalg.lstsq(points[inliers], w[inliers], rcond=None)[0]
+        plane = _least_squares(points[inliers], w[inliers])
     return inliers
+
+
+def _least_squares(points: NDArray[np.float64], w: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.linalg.lstsq(points.T @ points, points.T @ w, rcond=None)[0], np.float64)

@@ -51,10 +51,10 @@ def test_killed_while_densifying_fusing_and_merging(finished_run: FinishedRun, t
     full = finished_run.full(out, "--workspace", workspace)
 
     def inside_a_cluster() -> bool:
-        return any(workspace.glob("dense/*.partial/stereo/patchmatch/pass0_view00002.npz"))
+        return any(workspace.glob("dense/*.partial/stereo/patchmatch/pass0_view00002"))
 
     kill_when(inside_a_cluster, *full)
-    kept = {path: path.stat().st_mtime_ns for path in workspace.glob("dense/*.partial/stereo/patchmatch/pass*.npz")}
+    kept = {path: path.stat().st_mtime_ns for path in workspace.glob("dense/*.partial/stereo/patchmatch/pass*/*.npy")}
     assert kept
     assert not out.exists()
     assert not any(path.suffix != ".partial" for path in (workspace / "dense").iterdir())
