@@ -24,7 +24,7 @@ def explain(workspace: Workspace, names: Sequence[str], *, draw_all: bool = Fals
     """Explain the selection of some clusters at length and draw them, or tabulate all.
 
     Args:
-        workspace: With selected views. Pictures go to ``selection/pictures/CLUSTER.png``.
+        workspace: With selected views. Pictures go to ``selection/pictures/CLUSTER.svg``.
         names: Of clusters; none for the table.
         draw_all: Draw every cluster of the table.
 

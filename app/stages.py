@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from app.capture.inventory import Inventory
-from app.clustering.ground_plan import MapLabels
+from app.clustering.map_labels import MapLabels
 from app.executor import available_cores, split_cores
 from app.georegister.georeference import Georeference
 from app.log import ProgressLine

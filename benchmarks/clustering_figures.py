@@ -2,7 +2,7 @@
 
     python -m benchmarks.clustering_figures MODEL OUT_DIR CLUSTER...
 
-Writes `clusters.png` and `selection.png`. Without names of clusters it prints all, with their numbers of views and
+Writes `clusters.png` and `selection.svg`. Without names of clusters it prints all, with their numbers of views and
 keypoints and with how many views stand in the cells, to choose from; and what pictures and explanations cost, of every
 cluster.
 """
@@ -20,21 +20,22 @@ from unittest import mock
 import cv2
 import numpy as np
 
-from app.clustering.clusters import Cluster, Clustering
-from app.clustering.ground_plan import Image, MapLabels, blank, encode_png, write
+from app.clustering.clusters import SCENE_FOLDER, Cluster, Clustering
+from app.clustering.ground_plan import encode_png
+from app.clustering.map_labels import MapLabels
 from app.clustering.map_picture import write_map
 from app.clustering.options import ClusteringOptions
-from app.clustering.stage import SCENE_FOLDER, cluster
+from app.clustering.stage import cluster
 from app.scene.posed_scene import PosedScene
 from app.scene.read_model import open_scene
 from app.view_selection import selection
 from app.view_selection.options import SelectionOptions
-from app.view_selection.picture import draw_panels, draw_selection, legend_of_panels
+from app.view_selection.picture import PANEL_PX, document, draw_panels, draw_selection, legend, write
 from app.view_selection.problem import ProblemCutter
 from benchmarks.machine import describe_machine
 
 GAP_PX, TITLE_PX = 12, 40
-TEXT_SCALE = 0.7
+TITLE_SIZE_PX, LEGEND_SCALE, LEGEND_PX = 22, 1.6, 90
 COMPRESSION = 9
 
 
@@ -54,15 +55,12 @@ def main() -> None:
             print_costs(scene, clustering, Path(scratch) / "map.png")
             return
         arguments.out.mkdir(parents=True, exist_ok=True)
-        write_small(arguments.out / "clusters.png", cv2.imread(str(Path(scratch) / "map.png")))
+        # In 32 levels of each colour: nobody sees the difference, and a quarter fewer bytes.
+        small = encode_png(cv2.imread(str(Path(scratch) / "map.png")) | 7, COMPRESSION)
+        (arguments.out / "clusters.png").write_bytes(small)
         by_name = {found.name: found for found in clustering.clusters if found.name in arguments.clusters}
         chosen = [by_name[name] for name in arguments.clusters]
-        write_small(arguments.out / "selection.png", figure(scene, chosen))
-
-
-def write_small(path: Path, image: Image) -> None:
-    """Write a PNG in 32 levels of each colour: nobody sees the difference, and a quarter fewer bytes."""
-    path.write_bytes(encode_png(image | 7, COMPRESSION))
+        (arguments.out / "selection.svg").write_text(figure(scene, chosen), encoding="utf-8")
 
 
 def num_inside(scene: PosedScene, found: Cluster) -> int:
@@ -74,7 +72,7 @@ def num_inside(scene: PosedScene, found: Cluster) -> int:
 def print_costs(scene: PosedScene, clustering: Clustering, map_file: Path) -> None:
     """Median CPU-ms per cluster of explaining the selection and of drawing it, and CPU-s of the map."""
     cutter, options = ProblemCutter(scene), SelectionOptions()
-    costs: dict[str, list[float]] = {"select": [], "explain": [], "draw": [], "encode": []}
+    costs: dict[str, list[float]] = {"select": [], "explain": [], "draw": []}
 
     def timed(name: str, work: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: Any, **keywords: Any) -> Any:
@@ -91,7 +89,7 @@ def print_costs(scene: PosedScene, clustering: Clustering, map_file: Path) -> No
             problem = cutter.problem(found, options.visibility)
             selected = timed("select", selection.select_views)(problem, options)
             picture = timed("draw", draw_selection)(problem, found, selected, MapLabels())
-            sizes.append(len(timed("encode", encode_png)(picture)) / 1000)
+            sizes.append(len(picture) / 1000)
     started = time.process_time()
     write_map(scene, clustering, map_file, MapLabels())
     print(describe_machine())
@@ -100,26 +98,24 @@ def print_costs(scene: PosedScene, clustering: Clustering, map_file: Path) -> No
     print(f"map: {time.process_time() - started:.2f} s, {map_file.stat().st_size / 1000:.0f} kB")
 
 
-def figure(scene: PosedScene, clusters: list[Cluster]) -> Image:
+def figure(scene: PosedScene, clusters: list[Cluster]) -> str:
     """One column per cluster, before above after."""
     cutter, options = ProblemCutter(scene), SelectionOptions()
-    columns: list[Image] = []
-    for found in clusters:
+    before, after = TITLE_PX, 2 * TITLE_PX + PANEL_PX
+    parts = []
+    for column, found in enumerate(clusters):
         problem = cutter.problem(found, options.visibility)
         selected = selection.select_views(problem, options)
-        before, after = draw_panels(problem, found, selected, MapLabels())
-        titles = f"{found.name}: {len(found.image_names)} views", f"{len(selected.image_names)} of them selected"
-        parts = [titled(panel, title) for panel, title in zip((before, after), titles, strict=True)]
-        columns += [blank(GAP_PX, 2 * parts[0].shape[0]), np.concatenate(parts)]
-    body = np.concatenate(columns[1:], axis=1)
-    return np.concatenate([body, legend_of_panels(body.shape[1], text_scale=TEXT_SCALE)])
-
-
-def titled(panel: Image, title: str) -> Image:
-    """A panel with a line of text above."""
-    bar = blank(panel.shape[1], TITLE_PX)
-    write(bar, title, (2, TITLE_PX - 12), TEXT_SCALE)
-    return np.concatenate([bar, panel])
+        x = column * (PANEL_PX + GAP_PX)
+        parts += [
+            write(f"{found.name}: {len(found.image_names)} views", x, before - GAP_PX, TITLE_SIZE_PX),
+            write(f"{len(selected.image_names)} of them selected", x, after - GAP_PX, TITLE_SIZE_PX),
+            draw_panels(problem, found, selected, MapLabels(), ((x, before), (x, after))),
+        ]
+    bottom = after + PANEL_PX
+    symbols = legend(shows_solid=False)
+    parts.append(f'<g transform="translate(0 {bottom + LEGEND_PX // 3}) scale({LEGEND_SCALE})">{symbols}</g>')
+    return document(len(clusters) * (PANEL_PX + GAP_PX) - GAP_PX, bottom + LEGEND_PX, "\n".join(parts))
 
 
 if __name__ == "__main__":

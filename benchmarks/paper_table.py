@@ -16,9 +16,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from app.clustering.clusters import Clustering, find_blocks, name_clusters
+from app.clustering.clusters import SCENE_FOLDER, Clustering, find_blocks, name_clusters
 from app.clustering.options import ClusteringOptions
-from app.clustering.stage import SCENE_FOLDER
 from app.scene.posed_scene import PosedScene
 from app.scene.read_model import open_scene
 from app.view_selection.options import SelectionMethod, SelectionOptions

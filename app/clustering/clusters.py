@@ -19,6 +19,8 @@ from app.scene.posed_scene import PosedScene
 from fusion.region import GroundRegion
 
 FILE_NAME = "clusters.jsonl"
+SCENE_FOLDER = "scene"
+"""The model as arrays, beside that file."""
 FORMAT_VERSION = 1
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,3 +42,19 @@ class GroundGrid:
             z_range_m=z_range_m,
             padding_m=self.overlap_m,
         )
+
+
+def outline(cells: Sequence[Cell]) -> NDArray[np.int64]:
+    """(n, 2, 2) ends of the sides of the union of cells, in cells: a side between two of them isn't one."""
+    inside = set(cells)
+    sides = []
+    for i, j in cells:
+        for neighbour, ends in (
+            ((i - 1, j), ((i, j), (i, j + 1))),
+            ((i + 1, j), ((i + 1, j), (i + 1, j + 1))),
+            ((i, j - 1), ((i, j), (i + 1, j))),
+            ((i, j + 1), ((i, j + 1), (i + 1, j + 1))),
+        ):
+            if neighbour not in inside:
+                sides.append(ends)
+    return np.array(sides, dtype=np.int64).reshape(-1, 2, 2)

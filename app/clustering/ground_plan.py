@@ -1,17 +1,16 @@
-"""Pictures of the ground from above: dots, rays, cells, a scale bar and a north arrow, drawn with OpenCV."""
+"""Pictures of the ground from above: dots, cells, a scale bar and a north arrow, drawn with OpenCV."""
 
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from app.clustering.kernels import cover_with_dots, mix_color
+from app.clustering.map_labels import MapLabels, round_length
 from app.errors import CityReconError
 
 Image = NDArray[np.uint8]
@@ -29,19 +28,8 @@ SCALE_BAR_PX = 46
 _SHIFT = 4
 _SUBPIXELS = 1 << _SHIFT
 """OpenCV draws at this fraction of a pixel."""
-_DASH_PX, _GAP_PX = 9.0, 6.0
 _SWATCH_PX = (28, 14)
 _CHUNK_POSITIONS = 1 << 20
-
-
-@dataclass(frozen=True)
-class MapLabels:
-    """What the axes of the world are called."""
-
-    unit: str = "m"
-    """Of lengths."""
-    up: str = "N"
-    """Where y points."""
 
 
 class GroundPlan:
@@ -109,25 +97,6 @@ class GroundPlan:
         """Smooth lines between positions (n, 2 or more, 2)."""
         self._lines_px(self.to_pixels(ends), color, thickness_px)
 
-    def dashed_lines(self, ends: NDArray[np.float64], color: Color, thickness_px: int = 1) -> None:
-        """Dashed lines between positions (n, 2, 2); a dash begins and a dash ends each."""
-        dashes = []
-        for start, end in self.to_pixels(ends):
-            length = float(np.hypot(*(end - start)))
-            count = max(1, round((length + _GAP_PX) / (_DASH_PX + _GAP_PX)))
-            period = (length + _GAP_PX) / count
-            along = np.stack([np.arange(count) * period, np.arange(count) * period + period - _GAP_PX], axis=1)
-            dashes.append(start + along[..., None] / max(length, 1e-9) * (end - start))
-        if dashes:
-            self._lines_px(np.concatenate(dashes), color, thickness_px)
-
-    def rays(
-        self, starts: NDArray[np.float64], directions: NDArray[np.float64], length_px: float, color: Color
-    ) -> None:
-        """A line from each position (n, 3) along its direction (n, 3) as it looks from above."""
-        pixels = self.to_pixels(starts)
-        self._lines_px(np.stack([pixels, pixels + length_px * directions[:, :2] * (1, -1)], axis=1), color, 1)
-
     def _lines_px(self, ends: NDArray[np.float64], color: Color, thickness_px: int) -> None:
         fixed = np.round(np.clip(ends, -1e6, 1e6) * _SUBPIXELS).astype(np.int32)
         cv2.polylines(self.image, list(fixed), False, color, thickness_px, cv2.LINE_AA, _SHIFT)
@@ -169,28 +138,6 @@ class GroundPlan:
         cv2.rectangle(self.image, (0, 0), (width - 1, height - 1), LIGHT_GREY, 1)
 
 
-def outline(cells: Sequence[tuple[int, int]]) -> NDArray[np.int64]:
-    """(n, 2, 2) ends of the sides of the union of cells, in cells: a side between two of them isn't one."""
-    inside = set(cells)
-    sides = []
-    for i, j in cells:
-        for neighbour, ends in (
-            ((i - 1, j), ((i, j), (i, j + 1))),
-            ((i + 1, j), ((i + 1, j), (i + 1, j + 1))),
-            ((i, j - 1), ((i, j), (i + 1, j))),
-            ((i, j + 1), ((i, j + 1), (i + 1, j + 1))),
-        ):
-            if neighbour not in inside:
-                sides.append(ends)
-    return np.array(sides, dtype=np.int64).reshape(-1, 2, 2)
-
-
-def round_length(length: float) -> float:
-    """The greatest of 1, 2 and 5 times a power of ten that isn't longer."""
-    power = 10.0 ** math.floor(math.log10(length))
-    return power * max(factor for factor in (1, 2, 5) if factor * power <= length * (1 + 1e-9))
-
-
 def blank(width_px: int, height_px: int) -> Image:
     """A white image."""
     return np.full((height_px, width_px, 3), 255, dtype=np.uint8)
@@ -204,7 +151,7 @@ def legend(
     Args:
         image: To draw on.
         at_px: Lower left corner.
-        entries: ``dot``, ``ray``, ``box``, ``line``, ``dash`` or ``cross``; its colour; what it means.
+        entries: ``dot``, ``box``, ``line`` or ``cross``; its colour; what it means.
         text_scale: Of the texts; 1 makes letters about 20 pixels high.
     """
     x, y = at_px
@@ -214,15 +161,10 @@ def legend(
         swatch = GroundPlan(np.zeros(2), np.array([width, height]), _SWATCH_PX)
         if symbol == "box":
             swatch.boxes(np.array([[[2, 0], [width - 2, height]]]), color)
-        elif symbol == "dash":
-            swatch.dashed_lines(np.array([[[1, height / 2], [width - 1, height / 2]]]), color, 2)
         elif symbol == "cross":
             swatch.lines(np.array([[[8, 1], [20, 13]], [[8, 13], [20, 1]]]), color, 2)
         elif symbol == "line":
             swatch.lines(np.stack([left, right], axis=1), color, 2)
-        elif symbol == "ray":
-            swatch.lines(np.stack([left, right], axis=1), color)
-            swatch.dots(left, 2.6, color)
         else:
             swatch.dots((left + right) / 2, 2.6, color)
         top = y - round(9 * text_scale) - height // 2

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.clustering.clusters import Clustering
-from app.clustering.grid import Cell, GroundGrid
+from app.clustering.grid import Cell, GroundGrid, outline
 from app.clustering.ground_plan import (
     BLUE,
     INK,
@@ -22,13 +22,12 @@ from app.clustering.ground_plan import (
     Color,
     GroundPlan,
     Image,
-    MapLabels,
     blank,
     encode_png,
     legend,
-    outline,
     write,
 )
+from app.clustering.map_labels import MapLabels
 from app.scene.posed_scene import PosedScene
 
 _CELL_PX, _PANELS_PX, _MIN_HEIGHT_PX = 8, (760, 1600), 480

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from app.clustering.association import Blocks
-from app.clustering.clusters import Clustering, cluster_name, find_blocks, name_clusters
-from app.clustering.ground_plan import MapLabels
+from app.clustering.clusters import SCENE_FOLDER, Clustering, cluster_name, find_blocks, name_clusters
+from app.clustering.map_labels import MapLabels
 from app.clustering.map_picture import write_map
 from app.clustering.options import ClusteringOptions
 from app.errors import InputError
@@ -20,9 +20,6 @@ from app.scene.posed_scene import PosedScene
 from app.scene.read_model import open_scene, store_scene
 
 logger = logging.getLogger(__name__)
-
-SCENE_FOLDER = "scene"
-"""The model as arrays, beside the clusters."""
 
 
 def cluster(

@@ -57,8 +57,8 @@ class SelectionOptions:
     """Limit of each solver call, in nodes of its search: a limit of time would give other results on other machines.
     Where it is reached, the gap to the best possible is reported."""
     max_pictures: int = 200
-    """Clusters whose picture is drawn, spread evenly over all: about 2 s of work, and as many as one may look through.
-    `cityrecon explain` draws any others."""
+    """Clusters whose picture is drawn, spread evenly over all: as many as one may look through. `cityrecon explain`
+    draws any others."""
 
     def __post_init__(self) -> None:
         for name in ("n_vis", "n_match", "n_low", "min_shared_points", "max_solver_nodes"):

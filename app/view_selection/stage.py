@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from app.child_process import die_with_parent
-from app.clustering.clusters import Clustering
-from app.clustering.ground_plan import MapLabels
-from app.clustering.stage import SCENE_FOLDER
+from app.clustering.clusters import SCENE_FOLDER, Clustering
+from app.clustering.map_labels import MapLabels
 from app.scene.read_model import open_scene
 from app.view_selection.explanation import ExplanationSums
 from app.view_selection.options import SelectionOptions
@@ -48,7 +47,7 @@ def select(
 
     Args:
         clusters_dir: With ``clusters.jsonl`` and the clustered model.
-        output_dir: Gets ``selection.jsonl``, ``report.json`` and ``pictures/CLUSTER.png``.
+        output_dir: Gets ``selection.jsonl``, ``report.json`` and ``pictures/CLUSTER.svg``.
         options: The paper's parameters, and the method.
         labels: Of the pictures' axes; by default metres, and y to the north.
         num_workers: Processes; the result doesn't depend on it.

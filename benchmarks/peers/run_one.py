@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from app.clustering.stage import SCENE_FOLDER
+from app.clustering.clusters import SCENE_FOLDER
 from app.scene.posed_scene import PosedScene
 from app.scene.read_model import open_scene, store_scene
 from app.view_selection.options import SelectionMethod

@@ -146,7 +146,7 @@ def test_reports_are_there(finished_run: FinishedRun) -> None:
     ):
         assert (workspace / name).stat().st_size > 0, name
     clusters = [json.loads(line)["cluster"] for line in (workspace / "selection" / "selection.jsonl").open()]
-    assert {path.name for path in (workspace / "selection" / "pictures").iterdir()} == {f"{c}.png" for c in clusters}
+    assert {path.name for path in (workspace / "selection" / "pictures").iterdir()} == {f"{c}.svg" for c in clusters}
     report = json.loads((workspace / "sfm" / "report.json").read_text())
     assert report["registered"] == 3 * NUM_FRAMES
     assert not list(workspace.rglob("*.partial"))

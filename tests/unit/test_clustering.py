@@ -12,7 +12,8 @@ import pytest
 
 from app.clustering.association import Block, DropReason
 from app.clustering.clusters import Clustering, cluster_views
-from app.clustering.ground_plan import RED, MapLabels
+from app.clustering.ground_plan import RED
+from app.clustering.map_labels import MapLabels
 from app.clustering.map_picture import color_numbers, write_map
 from app.clustering.merging import merge_small_blocks
 from app.clustering.options import ClusteringOptions

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from app.clustering.clusters import Cluster, cluster_views
 from app.clustering.grid import GroundGrid
-from app.clustering.ground_plan import RED, MapLabels
+from app.clustering.map_labels import MapLabels
 from app.clustering.options import ClusteringOptions
 from app.config import RunConfig, update_config
 from app.errors import InputError
@@ -26,7 +28,7 @@ from app.stages import cluster_stage, select_stage
 from app.view_selection.describe import describe_selection, describe_view
 from app.view_selection.explanation import Coverage, Explanation
 from app.view_selection.options import SelectionOptions, Visibility
-from app.view_selection.picture import NOT_NEEDED, SOLID, draw_panels, draw_selection
+from app.view_selection.picture import BLUE, INK, LIGHT_GREY, NEEDED, NOT_NEEDED, PADDED, SOLID, draw_selection
 from app.view_selection.problem import ProblemCutter
 from app.view_selection.selection import Selection, read_selections, select_views
 from app.workspace import Workspace
@@ -145,11 +147,11 @@ def test_the_stage_draws_some_clusters_and_the_command_any(tmp_path: Path) -> No
         return {path.name: path.read_bytes() for path in sorted(pictures.iterdir())}
 
     first = drawn()
-    assert sorted(first) == [f"{names[0]}.png", f"{names[len(names) // 2]}.png"]
+    assert sorted(first) == [f"{names[0]}.svg", f"{names[len(names) // 2]}.svg"]
     list(explain(workspace, [names[1]]))
-    assert sorted(drawn()) == sorted([*first, f"{names[1]}.png"])
+    assert sorted(drawn()) == sorted([*first, f"{names[1]}.svg"])
     list(explain(workspace, [], draw_all=True))
-    assert sorted(drawn()) == [f"{name}.png" for name in names]
+    assert sorted(drawn()) == [f"{name}.svg" for name in names]
     assert {name: drawn()[name] for name in first} == first
 
 
@@ -163,8 +165,39 @@ def test_the_report_sums_the_explanations(tmp_path: Path) -> None:
     assert sum(report["selected_images_by_reason"].values()) == report["num_images_after_selection"]
 
 
-def _count(image: np.ndarray, color: tuple[int, int, int]) -> int:
-    return int(np.all(image == color, axis=-1).sum())
+class _Panels:
+    """What a picture of a cluster shows; places are whole numbers of pixels / 10, from the upper left corner."""
+
+    def __init__(self, text: str) -> None:
+        root = ElementTree.fromstring(text.replace(' xmlns="http://www.w3.org/2000/svg"', ""))
+        ground = root.find("defs/g")
+        self.before, self.after = root.findall("svg")
+        assert ground is not None
+        assert [used.get("href") for used in root.iter("use")] == [f"#{ground.get('id')}"] * 2
+        self.ground = ground
+        self.texts = [text.text for text in root.iter("text")]
+
+    @staticmethod
+    def lines(within: ElementTree.Element, color: str) -> list[tuple[tuple[int, int], str]]:
+        """Where each line of a colour begins, and how it goes on: `h1` is a dot, `l170 0` a ray to the right."""
+        paths = [path for group in within.findall(f".//g[@stroke='{color}']") for path in group.iter("path")]
+        paths += within.findall(f".//path[@stroke='{color}']")
+        found = [line for path in paths for line in re.findall(r"M(\d+) (\d+)([a-z][^M]*)", path.get("d", ""))]
+        return [((int(x), int(y)), drawn) for x, y, drawn in found]
+
+    def dots(self, within: ElementTree.Element, color: str) -> list[tuple[int, int]]:
+        """Places of the round dots of a colour."""
+        return [start for start, drawn in self.lines(within, color) if drawn == "h1"]
+
+    def rays(self, within: ElementTree.Element, color: str) -> list[str]:
+        """Directions of the rays of a colour."""
+        return [drawn for _, drawn in self.lines(within, color) if drawn.startswith("l")]
+
+    @staticmethod
+    def boxes(within: ElementTree.Element, color: str) -> list[tuple[int, ...]]:
+        """Left, bottom, right, top of filled boxes."""
+        (path,) = within.findall(f".//path[@fill='{color}']") or [ElementTree.Element("path")]
+        return [tuple(map(int, box)) for box in re.findall(r"M(\d+) (\d+)H(\d+)V(\d+)H\d+z", path.get("d", ""))]
 
 
 def test_a_picture_shows_all_views_before_and_the_selected_ones_after() -> None:
@@ -190,18 +223,48 @@ def test_a_picture_shows_all_views_before_and_the_selected_ones_after() -> None:
     selection = select_views(problem, SelectionOptions(n_match=1, n_low=5, n_high=5, min_shared_points=1))
     assert set(selection.image_names) > {"back0.jpg", "back1.jpg"}
     assert len(selection.image_names) == 5
-    before, after = draw_panels(problem, cluster, selection, MapLabels())
-    dot = _count(before, RED) / 14
-    assert dot > 10
-    assert _count(after, RED) == pytest.approx(2 * dot, rel=0.2)
-    assert _count(after, NOT_NEEDED) == pytest.approx(3 * dot, rel=0.2)
-    assert _count(before, NOT_NEEDED) == 0
-    whole = draw_selection(problem, cluster, selection, MapLabels())
-    assert _count(whole, NOT_NEEDED) > _count(after, NOT_NEEDED)
-    assert _count(whole, SOLID) == 0
+    panels = _Panels(draw_selection(problem, cluster, selection, MapLabels()))
+    assert len(panels.dots(panels.before, NEEDED)) == 14
+    assert len(panels.dots(panels.before, NOT_NEEDED)) == 0
+    needed, others, left_out = (panels.dots(panels.after, color) for color in (NEEDED, NOT_NEEDED, LIGHT_GREY))
+    assert (len(needed), len(others), len(left_out)) == (2, 3, 9)
+    assert {*needed, *others, *left_out} == {*panels.dots(panels.before, NEEDED)}
+    assert "Before: 14 views" in panels.texts and "After: 5 views, N_min = 5" in panels.texts
+    # The cells span 40 m, in the 514 pixels that the scale bar leaves, with a margin of 4 % on both sides.
+    scale = 5140 / (40 * 1.08)
 
-    solid = SolidColumns(corner_m=(10.0, 10.0), column_m=2.0, tops_m=np.array([[9.0, 1.0], [-np.inf, -np.inf]]))
-    before, after = draw_panels(replace(problem, solid=solid), cluster, selection, MapLabels())
-    rows, columns = np.nonzero(np.all(before == SOLID, axis=-1))
-    assert len(rows) == (np.ptp(rows) + 1) * (np.ptp(columns) + 1)
-    assert _count(after, SOLID) == len(rows) > 20
+    def places(*positions: tuple[float, ...]) -> np.ndarray:
+        return np.array([(2800 + x * scale, 2570 - y * scale) for x, y, *_ in positions])
+
+    # To half a pixel; points above each other are one dot.
+    dots = np.rint(places(*scene.points_in_world)) // 5 * 5
+    assert sorted(panels.dots(panels.ground, BLUE)) == sorted({(x, y) for x, y in dots.tolist()})
+    np.testing.assert_allclose(panels.boxes(panels.ground, PADDED), [places((-20, -20), (20, 20)).ravel()], atol=0.5)
+    back = problem.centers_in_world[[problem.image_names.index(f"back{k}.jpg") for k in range(2)]]
+    np.testing.assert_allclose(sorted(needed), sorted(places(*back).tolist()), atol=0.5)
+    assert panels.rays(panels.after, NEEDED) == ["l-170 0"] * 2
+    assert panels.rays(panels.after, NOT_NEEDED) == ["l170 0"] * 3
+    ((_, bar),) = panels.lines(panels.after, INK)
+    assert bar == f"v50h{round(10 * scale)}v-50" and "10 m" in panels.texts
+    assert not panels.boxes(panels.ground, SOLID)
+
+    tops_m = np.array([[9.0, 9.0, 1.0], [-np.inf, 1.0, 9.0]])
+    solid = SolidColumns(corner_m=(10.0, 10.0), column_m=2.0, tops_m=tops_m)
+    panels = _Panels(draw_selection(replace(problem, solid=solid), cluster, selection, MapLabels()))
+    expected = [places((10, 10), (12, 14)).ravel(), places((12, 14), (14, 16)).ravel()]
+    np.testing.assert_allclose(panels.boxes(panels.ground, SOLID), expected, atol=0.5)
+
+
+def test_a_picture_says_why_each_selected_view_is_in_and_holds_any_name() -> None:
+    cameras = {f'a<b> & "c" \x07{k}.jpg': level_camera([0, k, 1.5], 0) for k in range(3)}
+    scene = make_scene(cameras, [[10.0, y, 1.0] for y in np.linspace(-2, 4, 8)])
+    (cluster,) = cluster_views(scene, ClusteringOptions(min_keypoints_per_block=1)).clusters
+    problem = ProblemCutter(scene).problem(cluster, Visibility.FRUSTUM)
+    selection = select_views(problem, SelectionOptions(n_match=1, min_shared_points=1))
+    panels = _Panels(draw_selection(problem, cluster, selection, MapLabels(unit="steps", up="y")))
+    assert {title.text for title in panels.after.iter("title")} == {
+        f"{name}: {describe_view(selection, place)}".replace("\x07", "?")
+        for place, name in enumerate(selection.image_names)
+    }
+    assert not list(panels.before.iter("title"))
+    assert "10 steps" in panels.texts and "y" in panels.texts

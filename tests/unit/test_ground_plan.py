@@ -6,8 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from app.clustering.ground_plan import RED, WHITE, GroundPlan, MapLabels, encode_png, legend, outline, round_length
+from app.clustering.grid import outline
+from app.clustering.ground_plan import RED, WHITE, GroundPlan, encode_png, legend
 from app.clustering.kernels import cover_with_dots, mix_color
+from app.clustering.map_labels import MapLabels, round_length
 from tests.reference.pictures import plain_cover, plain_mix
 
 BLACK = (0, 0, 0)
@@ -94,23 +96,6 @@ def test_boxes_end_on_whole_pixels_and_are_cut_off_at_the_image() -> None:
     assert not _dark(far).any()
 
 
-def test_a_dashed_line_begins_and_ends_with_a_dash() -> None:
-    plan = GroundPlan(np.zeros(2), np.array([200.0, 20.0]), (200, 20))
-    plan.dashed_lines(np.array([[[20.5, 10.5], [180.5, 10.5]]]), BLACK)
-    row = _dark(plan)[9] > 0.5
-    assert row[21] and row[179] and not row[:19].any() and not row[183:].any()
-    assert 0.4 < row[20:181].mean() < 0.8
-    assert np.diff(row.astype(int)).clip(min=0).sum() == 11
-
-
-def test_a_ray_points_where_its_camera_looks() -> None:
-    plan = GroundPlan(np.zeros(2), np.array([40.0, 40.0]), (40, 40))
-    plan.rays(np.array([[20.0, 20.0, 1.0]]), np.array([[0.0, 1.0, 0.0]]), 10.0, BLACK)
-    rows, columns = np.nonzero(_dark(plan) > 0.3)
-    assert rows.min() == pytest.approx(9, abs=1.5) and rows.max() == pytest.approx(20, abs=1.5)
-    assert np.ptp(columns) <= 1
-
-
 def test_the_outline_of_cells_leaves_out_the_sides_between_them() -> None:
     """Three cells in the shape of an L have eight sides of which none is inside."""
     sides = outline([(0, 0), (1, 0), (0, 1)])
@@ -143,7 +128,7 @@ def test_a_label_outside_of_the_image_changes_nothing() -> None:
 def test_a_png_holds_the_image_and_names_in_any_script_can_be_written() -> None:
     plan = _plan((400, 200))
     plan.label("Straße 東京.jpg", (10, 100), 0.5)
-    legend(plan.image, (4, 40), tuple((kind, RED, kind) for kind in ("dot", "ray", "box", "line", "dash", "cross")))
+    legend(plan.image, (4, 40), tuple((kind, RED, kind) for kind in ("dot", "box", "line", "cross")))
     assert (plan.image[20:50] != np.array(WHITE)).any()
     decoded = cv2.imdecode(np.frombuffer(encode_png(plan.image), np.uint8), cv2.IMREAD_COLOR)
     np.testing.assert_array_equal(decoded, plan.image)
