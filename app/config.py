@@ -15,10 +15,10 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from app.capture.capture import CaptureOptions
+from app.capture.options import CaptureOptions
 from app.clustering.options import ClusteringOptions
 from app.errors import InputError
-from app.georegister.georegister import GeoregisterOptions
+from app.georegister.options import GeoregisterOptions
 from app.options import DensifyOptions
 from app.sfm.options import SfmOptions
 from app.view_selection.options import SelectionOptions

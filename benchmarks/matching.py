@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from app.capture.capture import CaptureOptions, capture
+from app.capture.capture import capture
+from app.capture.options import CaptureOptions
 from app.sfm.database import remove_database
 from app.sfm.descriptors import match_descriptors
 from app.sfm.features import extract_features

@@ -19,7 +19,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from app.capture.capture import CaptureOptions, capture
+from app.capture.capture import capture
+from app.capture.options import CaptureOptions
 from app.config import RunConfig, update_config
 from app.sfm.stage import run_sfm
 

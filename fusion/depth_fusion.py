@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from fusion.cloud import PointCloud, read_ply
@@ -61,6 +60,8 @@ def fuse_depth_maps(
     Raises:
         FusionError: a map is missing, or the workspace is unreadable.
     """
+    import pycolmap  # here, as those who only want to know the options needn't wait for it
+
     # COLMAP leaves out views without maps.
     for name in (workspace / "stereo" / "fusion.cfg").read_text(encoding="utf-8").rstrip("\n").split("\n"):
         for kind in ("depth_maps", "normal_maps"):

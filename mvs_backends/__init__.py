@@ -12,17 +12,39 @@ from collections.abc import Callable
 from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 
-from mvs_backends.acm import PROGRAMS, Acm
 from mvs_backends.base import MvsBackend, MvsOptions
-from mvs_backends.colmap import Colmap
-from mvs_backends.openmvs import OpenMvs
-from mvs_backends.patchmatch.backend import PatchMatch
 
+
+def _patchmatch() -> MvsBackend:
+    from mvs_backends.patchmatch.backend import PatchMatch
+
+    return PatchMatch()
+
+
+def _colmap() -> MvsBackend:
+    from mvs_backends.colmap import Colmap
+
+    return Colmap()
+
+
+def _openmvs() -> MvsBackend:
+    from mvs_backends.openmvs import OpenMvs
+
+    return OpenMvs()
+
+
+def _acm(program: str) -> MvsBackend:
+    from mvs_backends.acm import Acm
+
+    return Acm(program)
+
+
+# Whoever only wants to know names or options waits for none of them to be loaded.
 _BUILT_IN: dict[str, Callable[[], MvsBackend]] = {
-    "patchmatch": PatchMatch,
-    "colmap": Colmap,
-    "openmvs": OpenMvs,
-    **{program.lower(): partial(Acm, program) for program in PROGRAMS},
+    "patchmatch": _patchmatch,
+    "colmap": _colmap,
+    "openmvs": _openmvs,
+    **{program.lower(): partial(_acm, program) for program in ("ACMP", "ACMH", "ACMM", "ACMMP")},
 }
 
 

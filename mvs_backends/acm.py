@@ -26,7 +26,6 @@ from mvs_backends.depth_range import usable_views, view_depth_range
 from mvs_backends.hardware import chosen_gpus, gpu_environment
 from mvs_backends.process import find_program, run_subprocess
 
-PROGRAMS = ("ACMP", "ACMH", "ACMM", "ACMMP")
 _MAX_IMAGE_SIZE_PX = 3200
 _NUM_SOURCES = 8
 _SEARCHED_FROM, _SEARCHED_TO = 0.6, 1.2
@@ -38,7 +37,7 @@ _COARSEST_SIZE_PX = 1000
 
 
 class Acm(MvsBackend):
-    """One of the programs."""
+    """One of the programs: ACMP, ACMH, ACMM or ACMMP."""
 
     uses_gpu = True
 

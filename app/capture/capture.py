@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from enum import StrEnum
+from dataclasses import replace
 from pathlib import Path
 
 import pycolmap
@@ -14,6 +13,7 @@ import pycolmap
 from app.capture.gps import GpsTable, assign_gps, mean_position, read_gps_file
 from app.capture.image_check import ImageProbe, check_images, image_digest, png_size
 from app.capture.inventory import CameraEntry, FrameEntry, ImageEntry, Inventory
+from app.capture.options import CaptureOptions, RigMode
 from app.capture.poses import PoseFile, match_poses, read_pose_file
 from app.capture.rig import check_prefixes, read_rig_file
 from app.capture.scan import VIDEO_SUFFIXES, Listing, camera_of, check_stems, natural_key, scan, stem_of
@@ -23,49 +23,6 @@ from app.errors import CityReconError, InputError
 logger = logging.getLogger(__name__)
 
 _MIN_SHARED_FRAMES = 0.5
-
-
-class RigMode(StrEnum):
-    """Whether images of the same name in different folders were taken at the same instant."""
-
-    AUTO = "auto"
-    """Yes if at least half of the smaller folder's names are in another folder too."""
-    YES = "yes"
-    NO = "no"
-
-
-@dataclass(frozen=True, kw_only=True)
-class CaptureOptions:
-    """Options of the capture stage."""
-
-    rig_mode: RigMode = RigMode.AUTO
-    """Whether the cameras move as one rig."""
-    video_interval_s: float = 0.25
-    """Seconds between video frames: 2 m at 30 km/h."""
-    video_spacing_m: float | None = None
-    """Metres between video frames, if there is a GPS file; takes the place of the interval."""
-    video_min_displacement: float = 0.0025
-    """A video frame is kept when the image has moved by this share of its width (median over tracked corners) since
-    the last frame kept; less is standing still. Measured: 0.4 to 2 % per metre for cameras that look ahead, 1 to 4 %
-    to the side, and under 0.1 % by noise alone. 0 keeps all."""
-    video_jpeg_quality: int = 95
-    """Of the frames written, 1 to 100."""
-    num_threads: int = 0
-    """Threads that decode images; 0 for one per core."""
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.video_interval_s < float("inf"):
-            raise ValueError(f"video_interval_s must be above 0, not {self.video_interval_s}")
-        if self.video_spacing_m is not None and not 0.01 <= self.video_spacing_m < float("inf"):
-            raise ValueError(f"video_spacing_m must be at least 0.01, not {self.video_spacing_m}")
-        if not 0.0 <= self.video_min_displacement < 1.0:
-            raise ValueError(
-                f"video_min_displacement must be at least 0 and below 1, not {self.video_min_displacement}"
-            )
-        if not 1 <= self.video_jpeg_quality <= 100:
-            raise ValueError(f"video_jpeg_quality must be from 1 to 100, not {self.video_jpeg_quality}")
-        if self.num_threads < 0:
-            raise ValueError(f"num_threads must be at least 0, not {self.num_threads}")
 
 
 def capture(

@@ -33,6 +33,7 @@ from app.georegister.gravity import (
     solve_up,
     up_from_cameras,
 )
+from app.georegister.options import GeoregisterOptions
 from app.georegister.scale import frame_spacing, scale_from_rig
 from app.scene.posed_scene import PosedScene
 from app.scene.read_model import read_posed_scene
@@ -51,29 +52,6 @@ _CONFLICT_SIGMAS = 4.0
 _MIN_SHARE = 0.1
 _MIN_FITTING = 0.7
 _MAX_OUTLIER_NAMES = 100
-
-
-@dataclass(frozen=True, kw_only=True)
-class GeoregisterOptions:
-    """Options of the georegister stage."""
-
-    scale: float | None = None
-    """Metres per unit of the model, if known; goes before all other sources of scale."""
-    camera_height_m: float | None = None
-    """Height of the cameras over the road. Taken to be right to 5 %: GPS and rig go before it where they are better."""
-    z_is_up: bool = False
-    """The model's z axis points up already (an imported model, or known poses in a levelled frame): don't tilt it, and
-    without GPS don't turn or move it either."""
-    seed: int = 0
-    """Of the random sampling in robust estimates."""
-
-    def __post_init__(self) -> None:
-        for name in ("scale", "camera_height_m"):
-            value = getattr(self, name)
-            if value is not None and not 0.0 < value < math.inf:
-                raise ValueError(f"{name} must be above 0, not {value}")
-        if self.seed < 0:
-            raise ValueError(f"seed must be at least 0, not {self.seed}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Container
 from dataclasses import dataclass
 from enum import StrEnum
 
-import pycolmap
+_CAMERA_MODEL = "SIMPLE_RADIAL"
 
 
 class FeatureExtractor(StrEnum):
@@ -45,7 +46,7 @@ class SfmOptions:
     """Features are computed on images scaled down to this longer side; 0: no limit."""
     first_octave: int = 0
     """0: the image as it is; -1: doubled, more and finer features for about four times the CPU time."""
-    camera_model: str = "SIMPLE_RADIAL"
+    camera_model: str = _CAMERA_MODEL
     """COLMAP's camera model for cameras that the rig file says nothing about."""
     camera_params: tuple[float, ...] = ()
     """COLMAP's parameters for that model, pixels, for all cameras; empty: a focal length from EXIF, or a guess."""
@@ -105,7 +106,7 @@ class SfmOptions:
             raise ValueError("min_registered_ratio must be above 0 and at most 1")
         if not self.strategies:
             raise ValueError("strategies must name at least one strategy")
-        if self.camera_model not in pycolmap.CameraModelId.__members__:
+        if self.camera_model != _CAMERA_MODEL and self.camera_model not in _camera_models():
             raise ValueError(
                 f"camera_model must be one of COLMAP's, such as PINHOLE or OPENCV, not {self.camera_model}"
             )
@@ -114,3 +115,10 @@ class SfmOptions:
     def threads(self) -> int:
         """Threads to use."""
         return self.num_threads or len(os.sched_getaffinity(0))
+
+
+def _camera_models() -> Container[str]:
+    """COLMAP's names; asked only where the default was changed, as loading pycolmap takes longer than all the rest."""
+    import pycolmap
+
+    return pycolmap.CameraModelId.__members__

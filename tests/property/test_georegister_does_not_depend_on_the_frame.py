@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from app.capture.inventory import Inventory
-from app.georegister.georegister import GeoregisterOptions, georegister
+from app.georegister.georegister import georegister
+from app.georegister.options import GeoregisterOptions
 from tests.street_model import drive, inventory, random_similarity, write_model
 
 TRUTH = drive(16)

@@ -10,9 +10,10 @@ import numpy as np
 import pycolmap
 import pytest
 
-from app.capture.capture import CaptureOptions, RigMode, capture
+from app.capture.capture import capture
 from app.capture.describe import compress_names, describe
 from app.capture.inventory import Inventory
+from app.capture.options import CaptureOptions, RigMode
 from app.capture.scan import natural_key
 from app.errors import InputError
 

@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from app.capture.capture import CaptureOptions, capture
+from app.capture.capture import capture
 from app.capture.inventory import Inventory
+from app.capture.options import CaptureOptions
 from app.errors import InputError
 
 FRAME_RATE = 20.0

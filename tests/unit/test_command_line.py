@@ -37,6 +37,20 @@ def test_every_command_has_help_and_is_in_the_readme(command: str) -> None:
     assert f"`{command}`" in (ROOT / "README.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize(
+    ("module", "unused"),
+    [
+        ("app.commands", {"cv2", "numba", "ortools", "pycolmap"}),
+        ("app.clustering.stage", {"ortools", "pycolmap"}),
+        ("app.view_selection.stage", {"cv2", "pycolmap"}),
+    ],
+)
+def test_what_takes_long_to_load_is_loaded_by_those_who_use_it(module: str, unused: set[str]) -> None:
+    code = f"import sys, {module}; print(*sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=ROOT)
+    assert not unused & set(result.stdout.split())
+
+
 def test_every_option_of_a_stage_is_a_flag_of_its_command() -> None:
     sections = {"cluster": "clustering", "select": "selection", "sfm": "sfm", "fuse": "fusion", "densify": "stereo"}
     for command, section in sections.items():

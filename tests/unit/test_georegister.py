@@ -14,8 +14,9 @@ from app.capture.inventory import Inventory
 from app.errors import InputError
 from app.georegister.alignment import fit_planar
 from app.georegister.georeference import Georeference, GravitySource, ScaleSource
-from app.georegister.georegister import GeoregisterOptions, georegister
+from app.georegister.georegister import georegister
 from app.georegister.gravity import up_from_cameras
+from app.georegister.options import GeoregisterOptions
 from tests.street_model import (
     HEIGHT_M,
     ORIGIN,
