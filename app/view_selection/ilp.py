@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,8 @@ from ortools.linear_solver.python import model_builder_helper as mip
 from app.view_selection.quality import ViewQuality
 from app.view_selection.reduction import CoveringRows
 from app.view_selection.visibility import unpack_rows
+
+logger = logging.getLogger(__name__)
 
 _TOLERANCE = 1e-6
 """Of the solver; bounds closer than this to a whole number, or relatively to the objective, are that number."""
@@ -146,7 +149,7 @@ def best_selection(
         lambda program: _quality_model(program, worth, size),
         max_nodes,
     )
-    candidates = [smallest.selected] if found is None else [found, smallest.selected]
+    candidates = [smallest.selected] if found is None or found.sum() != size else [found, smallest.selected]
     selected = max(candidates, key=lambda candidate: total_quality(candidate, worth))
     total = total_quality(selected, worth)
     proven = objective_bound <= total * (1 + _TOLERANCE)
@@ -290,7 +293,8 @@ def _solve(
     """The best selection that the solver finds, if any, and a bound on the objective.
 
     Covering and matching constraints are many and few of them active. So each joins the model once the best selection
-    without it violates it; the result is the same, often without any call of the solver.
+    without it violates it; the result is the same, often without any call of the solver. A solver that violates what is
+    in the model is not believed in anything.
 
     Args:
         program: What to meet.
@@ -299,19 +303,23 @@ def _solve(
         make_model: The model without these constraints.
         max_nodes: Limit of each call.
     """
-    model = None
-    while True:
-        uncovered, unmatched = program.missing(selected)
-        if not uncovered.any() and not unmatched.any():
-            return selected, objective_bound
+    model, found_bound = None, objective_bound
+    lazy = np.ones(len(program.rows.bounds) + len(program.usable), dtype=np.bool_)
+    while not program.is_met_by(selected):
+        missing = lazy & (np.concatenate(program.missing(selected)) > 0)
+        if not missing.any():
+            logger.warning("the solver violates its own constraints; a selection made without it is kept")
+            return None, objective_bound
+        lazy &= ~missing
         model = make_model(program) if model is None else model
-        for row in np.flatnonzero(uncovered):
+        for row in np.flatnonzero(missing[: -len(program.usable)]):
             views = np.flatnonzero(program.views_of_rows[row]).tolist()
             model.constrain(views, [1.0] * len(views), float(program.rows.bounds[row]))
-        for view in np.flatnonzero(unmatched).tolist():
+        for view in np.flatnonzero(missing[-len(program.usable) :]).tolist():
             partners = np.flatnonzero(program.matches[view] & program.usable).tolist()
             model.constrain([*partners, view], [*[1.0] * len(partners), -float(program.n_match)], 0.0)
-        values, objective_bound = model.solve(max_nodes)
+        values, found_bound = model.solve(max_nodes)
         if values is None:
-            return None, objective_bound
+            return None, found_bound
         selected = values[: len(program.usable)] > 0.5
+    return selected, found_bound

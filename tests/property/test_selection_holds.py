@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from app.clustering.clusters import cluster_views
 from app.clustering.options import ClusteringOptions
+from app.view_selection import ilp
 from app.view_selection.ilp import (
     ViewProgram,
     best_selection,
@@ -63,9 +64,8 @@ def _random_program(seed: int, num_views: int) -> tuple[ViewProgram, np.ndarray]
     return program, visible
 
 
-@pytest.mark.parametrize("num_views", [5, 6, 7])
-def test_halves_of_views_are_no_solution(num_views: int) -> None:
-    """Each two views see a point that one of them must see: half of each view would do for the linear relaxation."""
+def _all_but_one_of(num_views: int) -> tuple[ViewProgram, ViewQuality]:
+    """Each two views see a point that one of them must see; the later a view, the better."""
     pairs = np.array(list(itertools.combinations(range(num_views), 2)))
     program = ViewProgram(
         rows=CoveringRows(
@@ -78,7 +78,13 @@ def test_halves_of_views_are_no_solution(num_views: int) -> None:
         n_match=2,
         min_views=1,
     )
-    worth = ViewQuality(quality=np.arange(1.0, num_views + 1), viewpoint=np.arange(num_views))
+    return program, ViewQuality(quality=np.arange(1.0, num_views + 1), viewpoint=np.arange(num_views))
+
+
+@pytest.mark.parametrize("num_views", [5, 6, 7])
+def test_halves_of_views_are_no_solution(num_views: int) -> None:
+    """Half of each view would do for the linear relaxation."""
+    program, worth = _all_but_one_of(num_views)
     smallest = smallest_selection(program, worth.quality, 1000)
     assert smallest.selected.sum() == smallest.size_bound == num_views - 1
     best = best_selection(program, smallest, worth, 1000)
@@ -116,6 +122,28 @@ def test_the_solver_finds_the_optimum_of_brute_force(seed: int, num_views: int) 
         assert found.selected.sum() == smallest
         assert found.quality == pytest.approx(best)
         assert found.quality_bound == found.quality
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0], ids=["selects nothing", "selects all"])
+def test_a_solver_that_violates_its_own_constraints_is_not_believed(
+    share: float, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Neither would the search end, nor would a selection of none, or of more than the size asked for, be right.
+
+    The first view must be in, which the five of most quality leave out.
+    """
+    program, worth = _all_but_one_of(6)
+    bits = np.concatenate([program.rows.bits, np.ones((1, 1), dtype=np.uint64)])
+    program = replace(program, rows=CoveringRows(bits=bits, bounds=np.ones(len(bits), dtype=np.int64)))
+    honest = smallest_selection(program, worth.quality, 1000)
+    monkeypatch.setattr(ilp._Model, "solve", lambda self, max_nodes: (np.full(6, share), 9.0))
+    best = best_selection(program, honest, worth, 1000)
+    assert program.is_met_by(best.selected) and best.selected.sum() == 5
+    if share == 0:
+        assert best.quality_bound == 20
+        distrusted = smallest_selection(program, worth.quality, 1000)
+        assert distrusted.selected.sum() == 5 and distrusted.size_bound == 1
+        assert caplog.text.count("the solver violates its own constraints") == 2
 
 
 @many
