@@ -32,33 +32,49 @@ def _enter(start: float, step: float, t: float, size: int) -> tuple[int, int, fl
     return column, 0, np.inf, np.inf
 
 
-@njit(cache=True)
-def _start(
-    x: float, y: float, dx: float, dy: float, num_x: int, num_y: int
-) -> tuple[float, float, int, int, float, float, tuple[int, int, float, float]]:
-    """Begin the walk over the columns that a line passes.
+@njit(cache=True, inline="always")  # called, walks take a tenth longer
+def _walk(
+    heights: NDArray[np.float64],
+    start: tuple[float, float, float],
+    way: tuple[float, float, float],
+    allowed: float,
+    lowers: bool,
+) -> bool:
+    """Go along a line over columns, and lower those that it passes, or find out whether they hide its end.
+
+    Args:
+        heights: (X, Y) of the columns; lowered in place to where the line passes them, if that is wanted.
+        start: x and y in columns from the corner of the first one, z as in ``heights``.
+        way: From the start to the end of the line, the same.
+        allowed: Which part of the line may be lower than the columns.
+        lowers: What to do.
 
     Returns:
-        Where the line enters the columns and where it leaves them (before it enters where it misses them); the first
-        column, i and j, and where the next ones begin along x and y; what `_step` needs. All along the line: 0 is its
-        start, 1 its end.
+        Whether more of the line is lower than the columns; false if they are lowered.
     """
+    num_x, num_y = heights.shape
+    x, y, z = start
+    dx, dy, dz = way
     enter, last = _clip(x, dx, num_x, 0.0, 1.0)
     enter, last = _clip(y, dy, num_y, enter, last)
     i, way_i, next_i, gap_i = _enter(x, dx, enter, num_x)
     j, way_j, next_j, gap_j = _enter(y, dy, enter, num_y)
-    return enter, last, i, j, next_i, next_j, (way_i, way_j, gap_i, gap_j)
-
-
-@njit(cache=True)
-def _step(
-    i: int, j: int, next_i: float, next_j: float, steps: tuple[int, int, float, float]
-) -> tuple[int, int, float, float]:
-    """The next column, and where those after it begin."""
-    way_i, way_j, gap_i, gap_j = steps
-    if next_i < next_j:
-        return i + way_i, j, next_i + gap_i, next_j
-    return i, j + way_j, next_i, next_j + gap_j
+    while enter <= last and 0 <= i < num_x and 0 <= j < num_y:
+        leave = min(next_i, next_j, last)
+        if lowers:
+            heights[i, j] = min(heights[i, j], z + dz * enter, z + dz * leave)
+        elif z + dz * 0.5 * (enter + leave) < heights[i, j]:
+            allowed -= leave - enter
+            if allowed < 0.0:
+                return True
+        if leave >= last:
+            break
+        enter = leave
+        if next_i < next_j:
+            i, next_i = i + way_i, next_i + gap_i
+        else:
+            j, next_j = j + way_j, next_j + gap_j
+    return False
 
 
 @njit(cache=True, nogil=True)
@@ -84,7 +100,6 @@ def lower_to_rays(
         column_m: Side of a column.
         gap_m: How far before its point a ray ends.
     """
-    num_x, num_y = heights.shape
     for ray in range(len(ray_points)):
         center, point = centers[ray_centers[ray]], points[ray_points[ray]]
         dx, dy, dz = point[0] - center[0], point[1] - center[1], point[2] - center[2]
@@ -92,16 +107,8 @@ def lower_to_rays(
         if length_m <= gap_m:
             continue
         part = 1.0 - gap_m / length_m
-        x, y, z = (center[0] - corner_m[0]) / column_m, (center[1] - corner_m[1]) / column_m, center[2]
-        dx, dy, dz = part * dx / column_m, part * dy / column_m, part * dz
-        enter, last, i, j, next_i, next_j, steps = _start(x, y, dx, dy, num_x, num_y)
-        while enter <= last and 0 <= i < num_x and 0 <= j < num_y:
-            leave = min(next_i, next_j, last)
-            heights[i, j] = min(heights[i, j], z + dz * enter, z + dz * leave)
-            if leave >= last:
-                break
-            enter = leave
-            i, j, next_i, next_j = _step(i, j, next_i, next_j, steps)
+        start = (center[0] - corner_m[0]) / column_m, (center[1] - corner_m[1]) / column_m, center[2]
+        _walk(heights, start, (part * dx / column_m, part * dy / column_m, part * dz), 0.0, True)
 
 
 @njit(cache=True)
@@ -109,22 +116,10 @@ def _is_hidden(
     tops: NDArray[np.float64], center: NDArray[np.float64], point: NDArray[np.float64], max_solid: float
 ) -> bool:
     """Whether the straight line between a camera and a point runs too far through solid columns; see below."""
-    num_x, num_y = tops.shape
     x, y, z = center
     dx, dy, dz = point[0] - x, point[1] - y, point[2] - z
     allowed = max_solid / max(np.sqrt(dx * dx + dy * dy), 1e-9)
-    enter, last, i, j, next_i, next_j, steps = _start(x, y, dx, dy, num_x, num_y)
-    while enter <= last and 0 <= i < num_x and 0 <= j < num_y:
-        leave = min(next_i, next_j, last)
-        if z + dz * 0.5 * (enter + leave) < tops[i, j]:
-            allowed -= leave - enter
-            if allowed < 0.0:
-                return True
-        if leave >= last:
-            break
-        enter = leave
-        i, j, next_i, next_j = _step(i, j, next_i, next_j, steps)
-    return False
+    return _walk(tops, (x, y, z), (dx, dy, dz), allowed, False)
 
 
 @njit(cache=True, nogil=True)
