@@ -78,6 +78,13 @@ class DenseJob:
             images=tuple(JobImage(**image) for image in data["images"]),
         )
 
+    def largest_image_px(self, options: DensifyOptions) -> int:
+        """Pixels of the largest of its images once they are reduced as the options say."""
+        sizes = [(camera.width, camera.height) for camera in self.cameras.values()]
+        limit = options.max_image_size_px
+        scales = [min(1.0, limit / max(size)) if limit else 1.0 for size in sizes]
+        return max(round(width * height * scale**2) for (width, height), scale in zip(sizes, scales, strict=True))
+
 
 def write_dense_job(
     folder: Path,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from app.clustering.clusters import Clustering
 from app.dense_job import DenseJob, write_dense_job
 from app.densify import Task, densify_inputs, densify_job, densify_options, fuse_inputs, fuse_job, run_tasks
 from app.errors import CityReconError, InputError
-from app.executor import split_cores
+from app.executor import available_cores, split_cores
 from app.log import ProgressLine
 from app.options import DensifyOptions
 from app.run import Run
@@ -26,7 +26,8 @@ from app.workspace import atomic_file, remove_tree
 from fusion.merge import merge_clouds
 from fusion.region import GroundRegion
 from mvs_backends import choose_backend, get_backend
-from mvs_backends.hardware import chosen_gpus, deal_gpus, gpu_environment
+from mvs_backends.base import MvsBackend
+from mvs_backends.hardware import chosen_gpus, deal_gpus, gpu_environment, memory_budget_gib
 
 logger = logging.getLogger(__name__)
 
@@ -128,7 +129,9 @@ def densify_stage(run: Run, *, jobs: Mapping[str, Path], folder: Path, num_jobs:
         num_sharers = min(len(jobs), num_jobs or len(jobs))
         environments = [gpu_environment(gpus) for gpus in deal_gpus(chosen_gpus(stereo.gpu_index), num_sharers)]
         stereo = replace(stereo, gpu_index="-1")
-    num_workers, num_threads = split_cores(len(jobs), len(environments) or num_jobs)
+    dense_jobs = {name: DenseJob.read(job) for name, job in jobs.items()}
+    most = len(environments) or num_jobs or _num_fitting(backend, dense_jobs.values(), densify)
+    num_workers, num_threads = split_cores(len(jobs), most)
     tasks = {
         name: Task(
             folder=folder / name,
@@ -143,7 +146,7 @@ def densify_stage(run: Run, *, jobs: Mapping[str, Path], folder: Path, num_jobs:
                 stereo,
                 num_threads,
             ),
-            num_steps=len(DenseJob.read(job).images),
+            num_steps=len(dense_jobs[name].images),
         )
         for name, job in jobs.items()
     }
@@ -207,6 +210,18 @@ def _densify(run: Run) -> DensifyOptions:
     """The options with the back-end that `auto` means here: a workspace's maps all come from one."""
     densify = run.config.densify
     return replace(densify, backend=choose_backend(densify.backend, run.config.stereo))
+
+
+def _num_fitting(backend: MvsBackend, jobs: Collection[DenseJob], options: DensifyOptions) -> int:
+    """How many of the jobs fit into memory side by side, at least one; 0: not known."""
+    needed_gib = max((backend.memory_gib(len(job.images), job.largest_image_px(options)) for job in jobs), default=0.0)
+    if not needed_gib:
+        return 0
+    budget_gib = memory_budget_gib(available_cores())
+    fitting = max(1, min(available_cores(), int(budget_gib / needed_gib)))
+    if fitting < min(available_cores(), len(jobs)):
+        logger.info("%d clusters at a time: each may need %.1f of %.1f GiB", fitting, needed_gib, budget_gib)
+    return fitting
 
 
 def _densify_options(run: Run) -> dict[str, object]:

@@ -9,8 +9,8 @@
 TRUTH is a folder as `sample_data.render_street` writes it (`images`, `gt.ply`, `gt_mesh.ply`), MODEL a COLMAP model of
 it in the same world, WORK a folder to work in. Each `--set` is one run with the preset's `PatchMatchOptions` but for
 the fields named (`a=1;b=2`); the preset itself runs first. `region=20` is special: side of the square in metres around
-the cameras that is reconstructed. Time is CPU-seconds, user and system, of the depth maps alone, with the kernels
-compiled before.
+the cameras that is reconstructed. With `--score-within 20` only what lies in such a square is scored. Time is
+CPU-seconds, user and system, of the depth maps alone, with the kernels compiled before.
 
 Scores are accuracy/completeness/F in % after thinning to 5 cm voxels: first over everything, then over surfaces with
 little texture alone: samples of `gt.ply` around which grey values deviate by less than 3 in the images that see them,
@@ -39,6 +39,7 @@ from fusion.depth_fusion import FusionOptions, fuse_depth_maps
 from fusion.thinning import thin
 from mvs_backends.base import MvsJob, Preset
 from mvs_backends.patchmatch.backend import estimate_maps
+from mvs_backends.patchmatch.geometry import level_camera
 from mvs_backends.patchmatch.options import PRESETS, PatchMatchOptions
 
 _THRESHOLDS_M = (0.02, 0.05, 0.1, 0.2)
@@ -54,6 +55,7 @@ def main() -> None:
     parser.add_argument("work", type=Path)
     parser.add_argument("--frames", default="0-9999", help="first-last, by file name")
     parser.add_argument("--max-image-size", type=int, default=0)
+    parser.add_argument("--score-within", type=float, default=0.0, help="side of a square in metres; 0: everywhere")
     parser.add_argument("--preset", type=Preset, default=Preset.NORMAL)
     parser.add_argument("--set", action="append", default=[], dest="settings")
     parser.add_argument("--threads", type=int, default=2)
@@ -66,6 +68,7 @@ def main() -> None:
     print(f"| setting | CPU-s/MP | points | {' | '.join(heads)} |")
     print("|---|---|---|" + "---|" * len(heads))
     samples = thin(read_ply(arguments.truth / "gt.ply"), _VOXEL_M).points
+    scored = np.array([[-1e9] * 3, [1e9] * 3])
     is_plain = np.zeros(0, np.bool_)
     for number, setting in enumerate(["", *arguments.settings]):
         changes = {key: ast.literal_eval(value) for key, value in _pairs(setting)}
@@ -81,15 +84,19 @@ def main() -> None:
         )
         if number == 0:
             _compile(job, options)
+            if arguments.score_within:
+                centers = np.array([level_camera(view, 0).center_in_world for view in job.views])
+                half = arguments.score_within / 2
+                scored[:, :2] = centers.mean(axis=0)[:2] + [[-half], [half]]
+                samples = samples[np.all((samples >= scored[0]) & (samples <= scored[1]), axis=1)]
             is_plain = texture_of_samples(job, samples, arguments.truth / "gt_mesh.ply") < _LITTLE_TEXTURE
         shutil.rmtree(job.workspace / "stereo" / "depth_maps")
         (job.workspace / "stereo" / "depth_maps").mkdir()
         started = _cpu_seconds()
         estimate_maps(job=job, options=options, seed=0, num_threads=arguments.threads)
         cost = (_cpu_seconds() - started) / (sum(v.width * v.height for v in job.views) / 1e6)
-        box = np.array([[-1e9] * 3, [1e9] * 3])
         fusion = FusionOptions(min_num_pixels=arguments.min_num_pixels)
-        cloud = fuse_depth_maps(job.workspace, job.workspace / "fused.ply", options=fusion, bounds=box)
+        cloud = fuse_depth_maps(job.workspace, job.workspace / "fused.ply", options=fusion, bounds=scored)
         found = _scores(cloud, samples, is_plain, arguments.truth / "gt_mesh.ply")
         cells = ["/".join(f"{100 * part:.1f}" for part in score) for score in found]
         print(f"| {setting or 'preset'} | {cost:.1f} | {len(cloud):,} | {' | '.join(cells)} |", flush=True)

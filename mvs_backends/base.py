@@ -139,6 +139,10 @@ class MvsBackend(ABC):
     def prepare(self) -> None:  # noqa: B027
         """Do once what parallel jobs would else all do at their start. Nothing by default."""
 
+    def memory_gib(self, num_views: int, image_px: int) -> float:
+        """What a job of so many views of so many pixels needs at least; 0 where a back-end can't say. By default 0."""
+        return 0.0
+
     @abstractmethod
     def estimate(self, *, job: MvsJob, options: MvsOptions, num_threads: int, progress: Progress | None = None) -> None:
         """Leave one depth map and one normal map per reference view at the job's paths.

@@ -16,15 +16,16 @@ from pathlib import Path
 
 from mvs_backends.base import Availability, MvsBackend, MvsJob, MvsOptions, Progress
 from mvs_backends.colmap_maps import has_maps
-from mvs_backends.patchmatch.images import ImageCache
+from mvs_backends.hardware import memory_budget_gib
+from mvs_backends.patchmatch.images import ImageCache, kept_bytes
 from mvs_backends.patchmatch.kernels import sweep_rows
 from mvs_backends.patchmatch.options import PatchMatchOptions, options_of_preset
 from mvs_backends.patchmatch.passes import Pass, Passes
 from mvs_backends.patchmatch.tiny_job import tiny_job
 
 logger = logging.getLogger(__name__)
-# Of a view that is worked on, beside the images kept; and of all that are worked on side by side.
-_BYTES_PER_PX, _MAX_VIEWS_BYTES = 200, 4_000_000_000
+# Of the program; of a view that is worked on, beside the images kept.
+_PROGRAM_GIB, _BYTES_PER_PX = 0.25, 200
 
 
 class PatchMatch(MvsBackend):
@@ -44,6 +45,10 @@ class PatchMatch(MvsBackend):
         with tempfile.TemporaryDirectory() as folder:
             options = options_of_preset(MvsOptions())
             estimate_maps(job=tiny_job(Path(folder)), options=options, seed=0, num_threads=1)
+
+    def memory_gib(self, num_views: int, image_px: int) -> float:
+        """See `MvsBackend.memory_gib`."""
+        return _PROGRAM_GIB + (kept_bytes(num_views, image_px) + _BYTES_PER_PX * image_px) / 2**30
 
     def estimate(self, *, job: MvsJob, options: MvsOptions, num_threads: int, progress: Progress | None = None) -> None:
         """See `MvsBackend.estimate`."""
@@ -76,7 +81,8 @@ def _make_maps(job: MvsJob, options: PatchMatchOptions, seed: int, num_threads: 
     num_views = len(job.views)
     folder = _prepare_folder(job, options, seed)
     largest_px = max(view.width * view.height for view in job.views)
-    at_a_time = min(num_threads, max(1, _MAX_VIEWS_BYTES // (_BYTES_PER_PX * largest_px)))
+    free_bytes = memory_budget_gib(num_threads) * 2**30 - kept_bytes(num_views, largest_px)
+    at_a_time = min(num_threads, max(1, int(free_bytes / (_BYTES_PER_PX * largest_px))))
     with ThreadPoolExecutor(num_threads) as executor, _views_executor(at_a_time) as views_executor:
         passes = Passes(job=job, options=options, seed=seed, images=ImageCache(job), folder=folder, executor=executor)
         before = 0.0

@@ -13,11 +13,18 @@ from mvs_backends.base import MvsError, MvsJob
 from mvs_backends.patchmatch.cost.kernels import pack_neighbours
 from mvs_backends.patchmatch.geometry import level_size
 
+_MAX_BYTES = 1_000_000_000
+
+
+def kept_bytes(num_views: int, image_px: int) -> int:
+    """What an `ImageCache` comes to hold of so many views of so many pixels, at all sizes."""
+    return min(_MAX_BYTES, num_views * image_px * 5 * 4 // 3)
+
 
 class ImageCache:
     """Grey images and their packed form, the least recently used ones let go. Threads may share it."""
 
-    def __init__(self, job: MvsJob, max_bytes: int = 1_000_000_000) -> None:
+    def __init__(self, job: MvsJob, max_bytes: int = _MAX_BYTES) -> None:
         self._job = job
         self._max_bytes = max_bytes
         self._lock = Lock()
