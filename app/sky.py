@@ -21,7 +21,7 @@ _MIN_RED_SHARE, _MIN_RED_SHARE_OF_SKIES, _MIN_RED_AREA = 0.5, 0.8, 0.01
 _MIN_IMAGES, _MAX_REDNESS_DEVIATION, _REDNESS_SPREAD = 5, 8.0, 3.0
 _MIN_AREA = 0.001
 """Of the image."""
-_PIXELS_PER_KEYPOINT = 4000
+_PIXELS_PER_KEYPOINT = 2500
 """More triangulated keypoints than one per so many pixels: not the sky."""
 _BORDER_PX = 4
 
