@@ -1,12 +1,12 @@
 """Judge a run by LiDAR scans.
 
-    python -m benchmarks.lidar WORKSPACE CLOUD.ply POSITIONS.json LIDAR.npz
+    python -m benchmarks.lidar WORKSPACE CLOUD.ply POSES.json LIDAR.npz
 
-POSITIONS holds `{image name: [x, y, z]}` of true camera positions, LIDAR an array `xyz` (N, 3), both in one metric
-frame, and for several scans an array `scan` (N,) with the number of each point's. The cloud is moved there by the rigid
-motion, and the similarity, that fit the cameras best. After the rigid one each scan is also moved onto the cloud by
-itself, which leaves the errors of stereo and of scale: not how the poses drift, nor how badly a GPS placed the scans
-beside each other.
+POSES holds `{image name: world_from_cam}` of the true cameras, 3x4 matrices of a rotation and a position, LIDAR an
+array `xyz` (N, 3), both in one metric frame, and for several scans an array `scan` (N,) with the number of each
+point's. The cloud is moved there by the cameras' mean rotation and the translation, and in the similarity fit the
+scale, that fit their positions best. After the rigid fit each scan is also moved onto the cloud by itself, which leaves
+the errors of stereo and of scale: not how the poses drift, nor how badly a GPS placed the scans beside each other.
 
 LiDAR scans are sparse and see less than the cameras. Accuracy counts those points of the cloud that lie within 50 cm of
 a LiDAR point where the scan samples a plane, and is the distance from that; their share is printed. Completeness counts
@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.scene.read_model import read_posed_scene
-from benchmarks.alignment import fit_rigid, fit_similarity, moved, position_errors
-from benchmarks.lidar_scan import fit_scan, surface_distances
+from benchmarks.alignment import fit_rigid, fit_similarity, mean_rotation, moved, position_errors
+from benchmarks.lidar_scan import fit_scans, surface_distances
 from benchmarks.machine import describe_machine
 from fusion.cloud import PointCloud, read_ply
 from fusion.compare import cloud_distances
@@ -39,27 +39,42 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("workspace", type=Path)
     parser.add_argument("cloud", type=Path)
-    parser.add_argument("positions", type=Path)
+    parser.add_argument("poses", type=Path)
     parser.add_argument("lidar", type=Path)
     parser.add_argument("--range-m", type=float, default=25.0)
     arguments = parser.parse_args()
     print(describe_machine(), end="\n\n")
     scene = read_posed_scene(arguments.workspace / "georegister" / "model")
-    truth = json.loads(arguments.positions.read_text(encoding="utf-8"))
+    truth = json.loads(arguments.poses.read_text(encoding="utf-8"))
     known = np.array([name in truth for name in scene.image_names])
     expected = np.array([truth[name] for name in scene.image_names if name in truth])
+    turns, positions = expected[:, :, :3], expected[:, :, 3]
+    found_turns, found_positions = scene.cam_from_world[known, :, :3].transpose(0, 2, 1), scene.centers_in_world[known]
+    rotation = mean_rotation(found_turns, turns)
     print(f"registered images   {len(scene.image_names)} of {len(truth)}")
+    print(
+        f"rotation error median {np.median(_angles_deg(turns.transpose(0, 2, 1) @ rotation @ found_turns)):.2f} degrees"
+    )
     found = read_ply(arguments.cloud)
-    scans = _scans(arguments.lidar, expected.astype(np.float32), arguments.range_m)
+    scans = _scans(arguments.lidar, positions.astype(np.float32), arguments.range_m)
     for name, fit in (("rigid fit", fit_rigid), ("similarity fit", fit_similarity)):
-        motion = fit(scene.centers_in_world[known], expected)
-        errors = 100 * position_errors(scene.centers_in_world[known], expected, motion)
-        print(f"\n{name}: position error median {np.median(errors):.1f} cm, 95 % {np.percentile(errors, 95):.1f} cm")
+        motion = fit(found_positions, positions, rotation)
+        errors = 100 * position_errors(found_positions, positions, motion)
+        scale = np.cbrt(np.linalg.det(motion[0]))
+        print(f"\n{name}, scale {scale:.4f}: position error median {np.median(errors):.1f} cm, ", end="")
+        print(f"95 % {np.percentile(errors, 95):.1f} cm")
         cloud = thin(moved(found, motion), _VOXEL_M).points
         _print_scores(cloud, scans)
         if fit is fit_rigid:
             print("\neach scan moved onto the cloud after the rigid fit")
-            _print_scores(cloud, [_moved_scan(scan, cloud) for scan in scans])
+            _print_scores(cloud, _moved_scans(scans, cloud))
+
+
+def _angles_deg(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(...) angles of rotations (..., 3, 3)."""
+    cosines = (np.trace(rotations, axis1=-2, axis2=-1) - 1) / 2
+    angles: NDArray[np.float64] = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    return angles
 
 
 def _scans(file: Path, positions: NDArray[np.float32], range_m: float) -> list[NDArray[np.float32]]:
@@ -71,12 +86,13 @@ def _scans(file: Path, positions: NDArray[np.float32], range_m: float) -> list[N
     return [scan[cloud_distances(scan, positions) <= range_m] for scan in scans]
 
 
-def _moved_scan(scan: NDArray[np.float32], cloud: NDArray[np.float32]) -> NDArray[np.float32]:
-    rotation, translation = fit_scan(scan, cloud)
-    found = (scan @ rotation.T + translation).astype(np.float32)
-    angle = np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))
-    shift = np.linalg.norm(found.mean(axis=0) - scan.mean(axis=0))
-    print(f"  a scan of {len(scan):,} points by {100 * shift:.0f} cm and {angle:.2f} degrees")
+def _moved_scans(scans: list[NDArray[np.float32]], cloud: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+    """Each scan on the cloud by itself."""
+    found = []
+    for scan, (rotation, translation) in zip(scans, fit_scans(scans, cloud), strict=True):
+        found.append((scan @ rotation.T + translation).astype(np.float32))
+        shift = np.linalg.norm(found[-1].mean(axis=0) - scan.mean(axis=0))
+        print(f"  a scan of {len(scan):,} points by {100 * shift:.0f} cm and {_angles_deg(rotation):.2f} degrees")
     return found
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,21 +43,29 @@ def surface_distances(points: NDArray[np.float32], scan: NDArray[np.float32]) ->
     return distances
 
 
-def fit_scan(scan: NDArray[np.float32], cloud: NDArray[np.float32]) -> Motion:
-    """The rigid motion that brings a scan (M, 3) onto the surfaces of a cloud (N, 3) that it lies about a metre off.
+def fit_scans(scans: Sequence[NDArray[np.float32]], cloud: NDArray[np.float32]) -> list[Motion]:
+    """The rigid motion of each scan (M, 3) onto the surfaces of a cloud (N, 3) that it lies less than a metre off.
 
     Iterated closest points, distances measured along the cloud's normals (Chen & Medioni 1992), large ones counting
     less.
     """
-    registration = import_open3d().pipelines.registration
-    geometry, utility = import_open3d().geometry, import_open3d().utility
-    source, target = (geometry.PointCloud(utility.Vector3dVector(side.astype(np.float64))) for side in (scan, cloud))
+    geometry, registration = import_open3d().geometry, import_open3d().pipelines.registration
+    target = geometry.PointCloud(_vectors(cloud))
     target.estimate_normals(geometry.KDTreeSearchParamKNN(20))
-    motion = np.eye(4)
-    for radius in _FIT_RADII_M:
-        method = registration.TransformationEstimationPointToPlane(registration.TukeyLoss(k=radius))
-        motion = registration.registration_icp(source, target, radius, motion, method).transformation
-    return motion[:3, :3], motion[:3, 3]
+    motions = []
+    for scan in scans:
+        motion = np.eye(4)
+        for radius in _FIT_RADII_M:
+            method = registration.TransformationEstimationPointToPlane(registration.TukeyLoss(k=radius))
+            found = registration.registration_icp(geometry.PointCloud(_vectors(scan)), target, radius, motion, method)
+            motion = found.transformation
+        motions.append((motion[:3, :3], motion[:3, 3]))
+    return motions
+
+
+def _vectors(points: NDArray[np.float32]) -> Any:
+    """Open3D's copy of points."""
+    return import_open3d().utility.Vector3dVector(points.astype(np.float64))
 
 
 def _neighbors(
