@@ -34,6 +34,10 @@ ImagesArgument = Annotated[
         metavar="IMAGES", help="Folder of images, of camera folders or of videos (one per camera); or one video."
     ),
 ]
+CloudArgument = Annotated[Path, typer.Argument(metavar="OUT.ply", help="Point cloud to write.")]
+FolderOption = Annotated[
+    Path | None, typer.Option("--workspace", metavar="DIR", help="Folder of the run. Default: beside OUT.")
+]
 GpsOption = Annotated[
     Path | None,
     typer.Option(
@@ -55,6 +59,9 @@ PosesOption = Annotated[
 ImportOption = Annotated[
     Path | None, typer.Option("--import", metavar="MODEL", help="Existing COLMAP model to use instead of mapping.")
 ]
+CompareOption = Annotated[
+    bool, typer.Option("--compare-batch", help="Also reconstruct the whole set at once, and compare.")
+]
 PartialOption = Annotated[
     bool, typer.Option("--allow-partial", help="Go on, and end with exit code 0, when some clusters fail.")
 ]
@@ -65,18 +72,14 @@ DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Say what would be
 def full(
     run: Run,
     images: ImagesArgument,
-    out: Annotated[Path, typer.Argument(metavar="OUT.ply", help="Point cloud to write.")],
-    workspace: Annotated[
-        Path | None, typer.Option("--workspace", metavar="DIR", help="Folder of the run. Default: beside OUT.")
-    ] = None,
+    out: CloudArgument,
+    workspace: FolderOption = None,
     gps: GpsOption = None,
     rig: RigOption = None,
     masks: MasksOption = None,
     poses: PosesOption = None,
     model: ImportOption = None,
-    compare_batch: Annotated[
-        bool, typer.Option("--compare-batch", help="Also reconstruct the whole set at once, and compare.")
-    ] = False,
+    compare_batch: CompareOption = False,
     allow_partial: PartialOption = False,
     dry_run: DryRunOption = False,
 ) -> None:

@@ -37,6 +37,45 @@ def is_hidden(a: NDArray[np.float64], b: NDArray[np.float64], houses: NDArray[np
     return False
 
 
+@njit(cache=True, inline="always")
+def _faces(
+    point: NDArray[np.float64], normal: NDArray[np.float64], center: NDArray[np.float64], reach_m: float
+) -> bool:
+    """Whether a point is near enough to a vehicle and faces it."""
+    dx, dy, dz = center[0] - point[0], center[1] - point[1], center[2] - point[2]
+    distance = math.sqrt(dx * dx + dy * dy + dz * dz)
+    return distance <= reach_m and dx * normal[0] + dy * normal[1] + dz * normal[2] >= _MIN_INCIDENCE * distance
+
+
+@njit(cache=True, inline="always")
+def _project(
+    image_from_world: NDArray[np.float64], point: NDArray[np.float64], size_px: NDArray[np.float64]
+) -> tuple[float, float, bool]:
+    """Pixel of a point, and whether it is in the image."""
+    m, (x, y, z) = image_from_world, point
+    depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+    if depth < 1.0:
+        return 0.0, 0.0, False
+    u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth
+    v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth
+    return u, v, 0.0 <= u < size_px[0] and 0.0 <= v < size_px[1]
+
+
+@njit(cache=True)
+def _begin_run(
+    chances: NDArray[np.float64], number: int, link_probability: float, mean_length: float
+) -> tuple[int, int]:
+    """After how many keyframes of a run a track takes part in it, and for how many.
+
+    The numbers of a point's runs follow from its first one's by irrational steps.
+    """
+    wait = int(3.0 * ((chances[1] + number * 0.4142135624) % 1.0))
+    if (chances[0] + number * 0.6180339887) % 1.0 >= link_probability:
+        return wait, 0
+    chance = (chances[2] + number * 0.7320508076) % 1.0
+    return wait, 1 + int(math.log1p(-chance) / math.log1p(-1.0 / mean_length))
+
+
 @njit(cache=True)
 def observe(
     points: NDArray[np.float64],
@@ -85,37 +124,21 @@ def observe(
     waits = np.empty(num_cameras, np.int64)
     remains = np.empty(num_cameras, np.int64)
     for p in range(len(points)):
-        x, y, z = points[p, 0], points[p, 1], points[p, 2]
         last_frame[:] = -2
         runs, length = 0, 0
-        for k in range(near_ranges[p, 0], near_ranges[p, 1]):
-            frame = frames_near[k]
-            dx, dy, dz = centers[frame, 0] - x, centers[frame, 1] - y, centers[frame, 2] - z
-            distance = math.sqrt(dx * dx + dy * dy + dz * dz)
-            if distance > reach_m[p]:
+        for frame in frames_near[near_ranges[p, 0] : near_ranges[p, 1]]:
+            if not _faces(points[p], normals[p], centers[frame], reach_m[p]):
                 continue
-            if dx * normals[p, 0] + dy * normals[p, 1] + dz * normals[p, 2] < _MIN_INCIDENCE * distance:
-                continue
-            hidden_known = False
+            is_in_sight = False
             for camera in range(num_cameras):
-                m = image_from_world[frame, camera]
-                depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-                if depth < 1.0:
+                u, v, inside = _project(image_from_world[frame, camera], points[p], size_px)
+                if not inside:
                     continue
-                u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth
-                v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth
-                if u < 0.0 or u >= size_px[0] or v < 0.0 or v >= size_px[1]:
-                    continue
-                if not hidden_known:
-                    if is_hidden(centers[frame], points[p], houses):
-                        break
-                    hidden_known = True
+                if not is_in_sight and is_hidden(centers[frame], points[p], houses):
+                    break
+                is_in_sight = True
                 if last_frame[camera] != frame - 1:
-                    # A new run; its numbers follow from the point's own by irrational steps.
-                    joins = (chances[p, 0] + runs * 0.6180339887) % 1.0 < link_probability
-                    waits[camera] = int(3.0 * ((chances[p, 1] + runs * 0.4142135624) % 1.0))
-                    chance = (chances[p, 2] + runs * 0.7320508076) % 1.0
-                    remains[camera] = 1 + int(math.log1p(-chance) / math.log1p(-1.0 / mean_length)) if joins else 0
+                    waits[camera], remains[camera] = _begin_run(chances[p], runs, link_probability, mean_length)
                     runs += 1
                 last_frame[camera] = frame
                 if waits[camera] > 0:
@@ -123,8 +146,7 @@ def observe(
                 elif remains[camera] > 0 and length < max_length:
                     remains[camera] -= 1
                     images[p, length] = frame * num_cameras + camera
-                    pixels[p, length, 0] = u
-                    pixels[p, length, 1] = v
+                    pixels[p, length] = u, v
                     length += 1
         lengths[p] = length
     return images, pixels, lengths
