@@ -19,7 +19,6 @@ Color = tuple[int, int, int]
 
 WHITE: Color = (255, 255, 255)
 INK: Color = (50, 46, 44)
-GREY: Color = (125, 120, 116)
 LIGHT_GREY: Color = (205, 200, 196)
 BLUE: Color = (196, 112, 40)
 RED: Color = (44, 38, 200)
@@ -174,10 +173,10 @@ def legend(
         x += width + 22 + text_width(text, text_scale)
 
 
-def write(image: Image, text: str, at_px: tuple[int, int], scale: float, color: Color = INK) -> None:
+def write(image: Image, text: str, at_px: tuple[int, int], scale: float) -> None:
     """Write a line of text from its lower left corner; other letters than ASCII's become question marks."""
     plain = text.encode("ascii", errors="replace").decode("ascii")
-    cv2.putText(image, plain, at_px, cv2.FONT_HERSHEY_SIMPLEX, scale, color, 1, cv2.LINE_AA)
+    cv2.putText(image, plain, at_px, cv2.FONT_HERSHEY_SIMPLEX, scale, INK, 1, cv2.LINE_AA)
 
 
 def text_width(text: str, scale: float) -> int:
@@ -192,8 +191,8 @@ def backing(image: Image, low_px: tuple[int, int], high_px: tuple[int, int]) -> 
     part[:] = np.round(part * 0.15 + 0.85 * 255).astype(np.uint8)
 
 
-def encode_png(image: Image, compression: int = 1) -> bytes:
-    """The image as PNG, compressed little and fast by default; 9 is most and slow.
+def encode_png(image: Image, compression: int = 6) -> bytes:
+    """The image as PNG; compression 9 is most and slow.
 
     Raises:
         CityReconError: it can't be encoded.

@@ -40,7 +40,6 @@ _MIN_CELL_PX = 4.0
 """Borders of smaller cells would fill the picture."""
 _GLASS = 0.55
 _NAME_PX = (125, 56)
-_COMPRESSION = 6
 _DROPPED: Color = (226, 222, 220)
 _FILLS: tuple[Color, ...] = (
     (214, 178, 144),
@@ -104,7 +103,7 @@ def write_map(scene: PosedScene, clustering: Clustering, path: Path, labels: Map
         (whole, f"{len(areas):,} clusters of {len(scene.image_names):,} views"),
         (detail, f"Detail: neighbours overlap by {2 * grid.overlap_m:g} {unit}"),
     )
-    path.write_bytes(encode_png(_composed(columns, labels), _COMPRESSION))
+    path.write_bytes(encode_png(_composed(columns, labels)))
 
 
 def _composed(columns: Sequence[tuple[GroundPlan, str]], labels: MapLabels) -> Image:
