@@ -13,8 +13,10 @@ _MAX_GRADIENT = 10.0
 """Per pixel, of 255: clouds are smoother."""
 _MIN_BRIGHTNESS = 90
 _MIN_SHARE_OF_HIGHLIGHTS = 0.75
+_MIN_TIMES_GROUND, _MIN_GROUND = 1.25, 0.1
 _MIN_BLUE_OVER_RED = 50
-"""The sky is blue or about as bright as the brightest things in the image; a plain wall in the shade isn't."""
+"""The sky is blue, or about as bright as the brightest things in the image or, where these are the sun and its glow,
+brighter than all below the horizon, if that is a tenth of the image; a plain wall in the shade isn't."""
 MAX_RED_OVER_BLUE = 10.0
 """Unless every sky is redder: at dusk, or in dust."""
 _MIN_RED_SHARE, _MIN_RED_SHARE_OF_SKIES, _MIN_RED_AREA = 0.5, 0.8, 0.01
@@ -54,11 +56,13 @@ def find_sky(
     grey = cv2.GaussianBlur(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY).astype(np.float32), (0, 0), 1.0)
     gradient = np.hypot(cv2.Scharr(grey, cv2.CV_32F, 1, 0), cv2.Scharr(grey, cv2.CV_32F, 0, 1)) / 32
     brightness = small.max(axis=2)
-    bright = max(_MIN_BRIGHTNESS, _MIN_SHARE_OF_HIGHLIGHTS * float(np.percentile(brightness, 98)))
+    above = _above_horizon(small.shape[:2], scale, calibration, cam_from_world)
+    bright = _MIN_SHARE_OF_HIGHLIGHTS * float(np.percentile(brightness, 98))
+    if above.mean() <= 1.0 - _MIN_GROUND:
+        bright = min(bright, _MIN_TIMES_GROUND * float(np.percentile(brightness[~above], 98)))
     reddish = small[:, :, 2].astype(np.int16) - small[:, :, 0]
-    bright_enough = brightness >= np.where(reddish <= -_MIN_BLUE_OVER_RED, _MIN_BRIGHTNESS, bright)
-    candidate = (gradient < _MAX_GRADIENT) & bright_enough & (reddish <= max_red_over_blue)
-    candidate &= _above_horizon(small.shape[:2], scale, calibration, cam_from_world)
+    bright_enough = brightness >= np.where(reddish <= -_MIN_BLUE_OVER_RED, 0.0, bright).clip(min=_MIN_BRIGHTNESS)
+    candidate = (gradient < _MAX_GRADIENT) & bright_enough & (reddish <= max_red_over_blue) & above
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(candidate.astype(np.uint8), connectivity=4)
     row, column = (np.floor(scale * keypoints_px).astype(np.int64).T)[::-1]
     inside = (row >= 0) & (row < labels.shape[0]) & (column >= 0) & (column < labels.shape[1])

@@ -13,7 +13,7 @@ _VERSIONS = {
     "cluster": 1,
     "select": 3,
     "jobs": 1,
-    "densify": 3,
+    "densify": 4,
     "fuse": 1,
 }
 

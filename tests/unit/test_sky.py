@@ -76,6 +76,16 @@ def test_a_deep_blue_sky_is_darker_than_the_houses() -> None:
     assert not sky[:, 175:].any()
 
 
+def test_the_sun_does_not_make_the_rest_of_the_sky_too_dark() -> None:
+    image = picture()
+    image[:100, :158] = (150, 130, 120)
+    image[30:80, 20:80] = 255
+    image[:100, 162:] = (95, 90, 85)
+    sky = sky_of(image, [])
+    assert sky[:95, 90:150].all()
+    assert not sky[:, 175:].any(), "a wall in the shade, not much brighter than the road"
+
+
 def test_a_sky_that_is_reddish_in_all_images() -> None:
     dusk = np.ascontiguousarray(picture()[:, :, ::-1])
     allowed = find_sky(
