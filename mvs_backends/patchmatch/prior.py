@@ -12,8 +12,8 @@ from mvs_backends.patchmatch.geometry import LevelCamera, warp
 
 # Grey values per pixel, of 255.
 _MAX_GRADIENT = 3.0
-_MIN_REGION_PX = 40
-_MIN_POINTS = 20
+_MIN_REGION_PX = 80
+_MIN_POINTS = 30
 _MAX_SCORED_POINTS = 2000
 _MAX_POINTS_OF_VIEW = 500_000
 _NUM_TRIALS, _NUM_REFINEMENTS = 60, 3
