@@ -35,6 +35,8 @@ from mvs_backends.patchmatch.search import (
 
 Arrays = dict[str, NDArray[Any]]
 _FINISHED = "finished"
+# What hides the region from a pixel is found as well, as there would else be a depth within the region all the same.
+_SHARE_BEFORE_REGION = 0.6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,15 +142,17 @@ class Passes:
                 for other in sorted(self.job.sources[view])
             ]
             plane = averaged_planes(found.plane, level_camera(self.job.views[view], level), others, self.executor)
-            limits = self._reference(view, level).inverse_range
-            known = plane[..., 0] > 0
-            plane[known, 0] = np.clip(plane[known, 0], limits[known, 0], limits[known, 1])
             found = replace(found, plane=plane)
         if level > 0:
             found = upsampled(found, self.images.get(view, level)[0], self._reference(view, 0))
-        plane = np.where((found.cost <= options.max_cost)[..., None], found.plane, np.float32(0))
+        camera = level_camera(self.job.views[view], 0)
+        mask = read_mask(self.job, view, camera.width, camera.height)
+        low, high = np.moveaxis(inverse_range(self.job, view, camera, mask), -1, 0)
+        w = found.plane[..., 0]
+        wanted = (w >= low) & (w <= high) & (found.cost <= options.max_cost)
+        plane = np.where(wanted[..., None], found.plane, np.float32(0))
         plane[_speckles(plane[..., 0], options.min_speckle_px)] = 0.0
-        depth, normal = depth_and_normal(plane, level_camera(self.job.views[view], 0).calibration)
+        depth, normal = depth_and_normal(plane, camera.calibration)
         write_maps(self.job, view, depth, normal)
 
     def _with_planes(
@@ -207,7 +211,7 @@ class Passes:
         calibration = camera.calibration
         return Reference(
             padded_grey=np.pad(grey, PADDING, mode="edge"),
-            inverse_range=inverse_range(self.job, view, camera, mask),
+            inverse_range=inverse_range(self.job, view, camera, mask, _SHARE_BEFORE_REGION),
             intrinsics=np.array(
                 [calibration[0, 0], calibration[1, 1], calibration[0, 2], calibration[1, 2]], np.float32
             ),

@@ -63,7 +63,9 @@ def sparse_points_in_image(
     return (pixels[:, :2] / pixels[:, 2:]).astype(np.float32), (1 / in_camera[:, 2]).astype(np.float32)
 
 
-def inverse_range(job: MvsJob, view: int, camera: LevelCamera, mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
+def inverse_range(
+    job: MvsJob, view: int, camera: LevelCamera, mask: NDArray[np.bool_] | None, share_before: float = 0.0
+) -> NDArray[np.float32]:
     """Where each pixel's ray passes through the region, not nearer than the view's sparse points allow.
 
     Args:
@@ -71,6 +73,7 @@ def inverse_range(job: MvsJob, view: int, camera: LevelCamera, mask: NDArray[np.
         view: the reference view.
         camera: the view at the level being searched.
         mask: (H, W) pixels that are wanted; all if there is none.
+        share_before: of the way to the region, how much is added before it.
 
     Returns:
         (H, W, 2) smallest and largest inverse depth; 0, 0 where nothing is wanted.
@@ -83,7 +86,7 @@ def inverse_range(job: MvsJob, view: int, camera: LevelCamera, mask: NDArray[np.
         # Nearer than the nearest source view, a pixel's match is hardly ever in its image.
         centers = [level_camera(job.views[s], 0).center_in_world for s in job.sources[view]]
         nearest = 0.5 * min((float(np.linalg.norm(c - camera.center_in_world)) for c in centers), default=0.0)
-    entry = np.maximum(entry, nearest)
+    entry = np.maximum((1 - share_before) * entry, nearest)
     wanted = (leave > entry) & (entry > 0)
     if mask is not None:
         wanted &= mask

@@ -153,6 +153,13 @@ def test_masked_pixels_and_rays_beside_the_region_get_no_depth(tmp_path: Path) -
     assert (depths[1][:, 60:] > 0).mean() > 0.8
 
 
+def test_nothing_is_found_behind_what_hides_the_region(tmp_path: Path) -> None:
+    job = plane_job(tmp_path, normal=(0.0, 0.0, 1.0), num_views=3)
+    behind = np.array([[[-20.0, -20.0, 5.15], [20.0, 20.0, 12.0]]])
+    estimate_maps(job=dataclasses.replace(job, boxes_in_world=behind), options=QUICK, seed=0, num_threads=1)
+    assert np.mean([depth > 0 for depth, _ in maps(job)]) < 0.01
+
+
 def test_colmap_fuses_the_maps(tmp_path: Path) -> None:
     job = plane_job(tmp_path, normal=SLANTED)
     run(job)
