@@ -26,6 +26,10 @@ def main() -> None:
     parser.add_argument("--name", action="append", required=True, dest="names")
     parser.add_argument("--width", type=int, default=320)
     arguments = parser.parse_args()
+    for folder in arguments.workspaces:
+        for name in arguments.names:
+            if not (folder / "stereo" / "depth_maps" / f"{name}.geometric.bin").exists():
+                parser.error(f"{folder} has no depth map of {name}")
     rows = [_row(arguments.workspaces, name, arguments.width) for name in arguments.names]
     cv2.imwrite(str(arguments.out), np.concatenate(rows))
 
