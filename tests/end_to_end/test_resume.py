@@ -158,7 +158,9 @@ def test_a_fusion_option_redoes_fusion_only(finished_run: FinishedRun, tmp_path:
     coarse = tmp_path / "coarse.ply"
     result = cityrecon("fuse", workspace, "--out", coarse, "--min-num-pixels", "4", "--voxel-m", "0.1")
     assert result.returncode == 0, result.stderr
-    whole, thinned = (np.unique(np.floor(read_ply(path).points / 0.1), axis=0) for path in (out, coarse))
+    whole, thinned = (
+        np.unique(np.floor(read_ply(path).points.astype(np.float64) / 0.1), axis=0) for path in (out, coarse)
+    )
     np.testing.assert_array_equal(thinned, whole)
     assert len(read_ply(coarse)) < 1.02 * len(thinned), "one point per voxel, and per cluster at the borders of cells"
 
