@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,10 @@ from numpy.typing import NDArray
 
 from mvs_backends.patchmatch import prior
 from mvs_backends.patchmatch.geometry import LevelCamera
+from mvs_backends.patchmatch.options import PatchMatchOptions
 from mvs_backends.patchmatch.prior import even_regions, points_in_image, region_planes
+from mvs_backends.patchmatch.search import Hypotheses, LevelSearch
+from tests.reference.stereo_scene import HEIGHT, WIDTH, WINDOW, wall_scene
 
 RATE = 600.0
 LEFT, RIGHT = np.array([0.1, 2e-4, -1e-4]), np.array([0.05, -1e-4, 2e-4])
@@ -124,3 +128,31 @@ def test_very_many_points_of_a_view_are_thinned_evenly(monkeypatch: pytest.Monke
     points = points_in_image(plane, np.ones((40, 60), np.bool_), camera, camera)
     assert 50 < len(points) <= 100
     assert np.ptp(points[:, 1]) > 35
+
+
+def test_credible_pixels_keep_their_hypotheses_and_others_get_the_plane() -> None:
+    made, wall = wall_scene(5)
+    rng = np.random.default_rng(5)
+    flat = made.kernel_reference._replace(padded_grey=np.full_like(made.kernel_reference.padded_grey, 128))
+    credible = rng.random((HEIGHT, WIDTH)) < 0.3
+    found = Hypotheses(
+        plane=(wall * 1.05).astype(np.float32),
+        cost=np.full((HEIGHT, WIDTH), 1.5, np.float32),
+        view=np.zeros((HEIGHT, WIDTH), np.int8),
+    )
+    y, x = np.nonzero(credible)
+    points = np.stack([x, y, wall[y, x, 0]], axis=1).astype(np.float32)
+    with ThreadPoolExecutor(1) as executor:
+        search = LevelSearch(
+            reference=flat,
+            sources=made.kernel_sources,
+            window=WINDOW,
+            options=PatchMatchOptions(),
+            seed=0,
+            executor=executor,
+        )
+        result = search.with_planes(found, credible, points)
+    np.testing.assert_array_equal(result.plane[credible], found.plane[credible])
+    np.testing.assert_array_equal(result.cost[credible], found.cost[credible])
+    np.testing.assert_allclose(result.plane[~credible], wall[~credible], atol=1e-5)
+    assert (result.cost[~credible] < PatchMatchOptions().max_cost).all()
