@@ -220,7 +220,7 @@ def _num_fitting(backend: MvsBackend, jobs: Collection[DenseJob], options: Densi
     budget_gib = memory_budget_gib(available_cores())
     fitting = max(1, min(available_cores(), int(budget_gib / needed_gib)))
     if fitting < min(available_cores(), len(jobs)):
-        logger.info("%d clusters at a time: each may need %.1f of %.1f GiB", fitting, needed_gib, budget_gib)
+        logger.info("clusters at a time: %d, as each may need %.1f of %.1f GiB", fitting, needed_gib, budget_gib)
     return fitting
 
 
