@@ -17,6 +17,7 @@ from fusion.cloud import read_ply
 from mvs_backends import backend_names, get_backend
 from mvs_backends.base import MvsError, MvsJob, MvsOptions, Preset
 from mvs_backends.patchmatch.backend import estimate_maps
+from mvs_backends.patchmatch.images import ImageCache, kept_bytes
 from mvs_backends.patchmatch.options import PatchMatchOptions
 from tests.reference.colmap_maps import read_map
 from tests.reference.plane_scene import plane_job, true_depth
@@ -199,6 +200,14 @@ def test_view_without_sources_gets_an_empty_map(tmp_path: Path) -> None:
     depths = [depth for depth, _ in maps(job)]
     assert not depths[0].any()
     assert depths[1].any()
+
+
+def test_kept_images_take_as_many_bytes_as_is_said(tmp_path: Path) -> None:
+    job = plane_job(tmp_path, normal=SLANTED, num_views=3)
+    cache = ImageCache(job)
+    kept = sum(part.nbytes for view in range(3) for level in range(6) for part in cache.get(view, level))
+    assert kept_bytes(3, 112 * 80) == pytest.approx(kept, rel=0.05)
+    assert kept_bytes(1000, 10**9) == kept_bytes(2000, 10**9)
 
 
 def test_unreadable_image_is_named(tmp_path: Path) -> None:
