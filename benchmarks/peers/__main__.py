@@ -1,11 +1,11 @@
 """Time and quality of the program and of other methods against the number of images, and a figure of the times.
 
 python -m benchmarks.peers OUTPUT.json FIGURE.svg [--limit-s 3600] [--images 250 500 1000 2000 4000 8000 12000]
-                           [--methods METHOD ...] [--scaling SCALING.json]
+                           [--methods METHOD ...] [--jobs 1] [--scaling SCALING.json]
 
 The drives are like seq5, one for each number of images. A method isn't tried on more images once it has taken more
-than the limit, in CPU-seconds. What OUTPUT.json holds from earlier runs stays. ``--scaling`` adds the program's times
-from `benchmarks.scaling` to the figure.
+than the limit, in CPU-seconds. As many methods as ``--jobs`` work side by side. ``--scaling`` adds the program's times
+on more images from `benchmarks.scaling` to the figure.
 
 Coverage: keypoints that at least two images of one cluster see, projecting into them from within 38 m. Matchability:
 images of a cluster that see 20 common keypoints with at least two others of it. Both on every fourth keypoint.
@@ -15,12 +15,16 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import tempfile
-from dataclasses import replace
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.sparse import csr_array, vstack
+from scipy.spatial import KDTree
 
 from app.clustering.options import ClusteringOptions
 from app.scene.posed_scene import PosedScene
@@ -38,6 +42,38 @@ _EVERY_KEYPOINT = 4
 _DRIVE = PRESETS["seq5"]
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Town:
+    """A simulated drive."""
+
+    model_dir: Path
+    num_images: int
+    seen: csr_array
+    """(N, P / 4) which image sees which keypoint from near enough."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Row:
+    """One method on one town; all but the time are None where it took more than the limit."""
+
+    num_images: int
+    method: str
+    cpu_s: float
+    num_clusters: int | None = None
+    views_per_cluster: float | None = None
+    coverage: float | None = None
+    matchability: float | None = None
+
+    def __str__(self) -> str:
+        """A row of the table."""
+        if self.num_clusters is None:
+            return f"| {self.num_images:,} | {self.method} | over {self.cpu_s:,.0f} | | | | |"
+        return (
+            f"| {self.num_images:,} | {self.method} | {self.cpu_s:,.1f} | {self.num_clusters} "
+            f"| {self.views_per_cluster:.1f} | {self.coverage:.1%} | {self.matchability:.1%} |"
+        )
+
+
 def main() -> None:
     """Print a row per method and number of images; write them and the figure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -46,66 +82,85 @@ def main() -> None:
     parser.add_argument("--limit-s", type=int, default=3600)
     parser.add_argument("--images", type=int, nargs="+", default=[250, 500, 1000, 2000, 4000, 8000, 12000])
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
+    parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--scaling", type=Path)
     arguments = parser.parse_args()
+    rows: list[_Row] = []
+    with tempfile.TemporaryDirectory(dir=arguments.output.parent) as scratch:
+        towns = [_write_town(wanted, Path(scratch) / str(wanted)) for wanted in sorted(arguments.images)]
+
+        def run(method: str) -> None:
+            for row in _run_method(method, towns, arguments.limit_s):
+                print(row, file=sys.stderr, flush=True)
+                rows.append(row)
+                arguments.output.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
+
+        with ThreadPoolExecutor(arguments.jobs) as pool:
+            list(pool.map(run, arguments.methods))
     print(describe_machine())
-    print(f"{_DRIVE}; limit {arguments.limit_s} CPU-s")
+    print(f"{_DRIVE}; limit {arguments.limit_s} CPU-s; {arguments.jobs} methods side by side")
     print("| images | method | CPU-s | clusters | views per cluster | coverage | matchability |")
     print("|---|---|---|---|---|---|---|")
-    rows = json.loads(arguments.output.read_text()) if arguments.output.exists() else []
-    given_up: set[str] = set()
-    for wanted in sorted(arguments.images):
-        with tempfile.TemporaryDirectory() as scratch:
-            num_images = _write_model(wanted, Path(scratch) / "model")
-            store_scene(Path(scratch) / "model", Path(scratch) / "scene")
-            scene = open_scene(Path(scratch) / "scene")
-            seen = _seen_keypoints(scene)
-            for method in arguments.methods:
-                if method in given_up:
-                    continue
-                run = run_method(method, Path(scratch) / "model", arguments.limit_s)
-                if run is None:
-                    given_up.add(method)
-                    print(f"| {num_images:,} | {method} | over {arguments.limit_s} | | | | |", flush=True)
-                    continue
-                coverage, matchability = _quality(seen, run[1])
-                views = float(np.mean([len(images) for images in run[1]]))
-                rows.append({"num_images": num_images, "method": method, "cpu_s": run[0]})
-                print(
-                    f"| {num_images:,} | {method} | {run[0]:.1f} | {len(run[1])} | {views:.1f} "
-                    f"| {100 * coverage:.1f} % | {100 * matchability:.1f} % |",
-                    flush=True,
-                )
-                arguments.output.write_text(json.dumps(rows, indent=1) + "\n")
+    for row in sorted(rows, key=lambda row: (row.num_images, METHODS.index(row.method))):
+        print(row)
+    _write_figure(arguments.figure, rows, arguments.scaling)
+
+
+def _run_method(method: str, towns: list[_Town], limit_s: int) -> Iterator[_Row]:
+    """On ever larger towns, until it takes more than the limit."""
+    for town in towns:
+        run = run_method(method, town.model_dir, limit_s)
+        if run is None:
+            yield _Row(num_images=town.num_images, method=method, cpu_s=limit_s)
+            return
+        cpu_s, clusters = run
+        coverage, matchability = _quality(town.seen, clusters)
+        yield _Row(
+            num_images=town.num_images,
+            method=method,
+            cpu_s=cpu_s,
+            num_clusters=len(clusters),
+            views_per_cluster=float(np.mean([len(images) for images in clusters])),
+            coverage=coverage,
+            matchability=matchability,
+        )
+
+
+def _write_figure(path: Path, rows: list[_Row], scaling: Path | None) -> None:
     series = {
-        method: sorted((row["num_images"], row["cpu_s"]) for row in rows if row["method"] == method)
+        method: sorted(
+            (row.num_images, row.cpu_s) for row in rows if row.method == method and row.num_clusters is not None
+        )
         for method in METHODS
     }
-    if arguments.scaling:
+    if scaling:
         largest = max(x for x, _ in series[OURS])
-        runs = json.loads(arguments.scaling.read_text())
+        runs = json.loads(scaling.read_text())
         series[OURS] += [
             (run["num_images"], run["clustering"]["cpu_s"] + run["selection"]["cpu_s"])
             for run in runs
             if run["num_images"] > 1.05 * largest
         ]
-    write_log_chart(arguments.figure, series, x_title="images", y_title="CPU-seconds")
+    write_log_chart(path, series, x_title="images", y_title="CPU-seconds")
 
 
-def _write_model(wanted: int, folder: Path) -> int:
+def _write_town(wanted: int, folder: Path) -> _Town:
     num_keyframes = round(wanted / len(CAMERAS))
     num_points = round(_DRIVE.num_points * num_keyframes / _DRIVE.num_keyframes)
     write_drive(replace(_DRIVE, num_keyframes=num_keyframes, num_points=num_points), folder)
-    return num_keyframes * len(CAMERAS)
+    with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
+        store_scene(folder, Path(scratch))
+        seen = _seen_keypoints(open_scene(Path(scratch)))
+    return _Town(model_dir=folder, num_images=num_keyframes * len(CAMERAS), seen=seen)
 
 
 def _seen_keypoints(scene: PosedScene) -> csr_array:
     """(N, P / 4) which image sees which keypoint from near enough."""
     keypoints = scene.points_in_world[::_EVERY_KEYPOINT]
-    reach = ClusteringOptions().max_camera_distance_m
+    tree = KDTree(keypoints[:, :2])
     rows = []
     for image, center in enumerate(scene.centers_in_world):
-        near = np.flatnonzero(np.hypot(*(keypoints[:, :2] - center[:2]).T) <= reach)
+        near = np.array(tree.query_ball_point(center[:2], ClusteringOptions().max_camera_distance_m), dtype=np.int64)
         visible = near[sees(scene, image, keypoints[near])]
         ones = np.ones(len(visible), dtype=np.float32)
         rows.append(csr_array((ones, visible, np.array([0, len(visible)])), shape=(1, len(keypoints))))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import resource
+import signal
 import subprocess
 import sys
 import tempfile
@@ -47,9 +48,10 @@ def run_method(method: str, model_dir: Path, limit_s: int) -> tuple[float, Clust
             return run.cpu_s, [scene.image_names.rows_of(selection.image_names) for selection in selections]
         output = Path(scratch) / "clusters.json"
         command = [sys.executable, "-m", __name__, method, str(model_dir), str(output), str(limit_s)]
-        subprocess.run(command, check=False, stderr=subprocess.DEVNULL)
-        if not output.exists():
+        process = subprocess.run(command, check=False)
+        if process.returncode == -signal.SIGKILL:
             return None
+        process.check_returncode()
         record = json.loads(output.read_text())
         return record["cpu_s"], [np.array(images, dtype=np.int64) for images in record["clusters"]]
 
