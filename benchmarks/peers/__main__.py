@@ -1,11 +1,11 @@
 """Time and quality of the program and of other methods against the number of images, and a figure of the times.
 
 python -m benchmarks.peers OUTPUT.json FIGURE.svg [--limit-s 3600] [--images 250 500 1000 2000 4000 8000 12000]
-                           [--methods METHOD ...] [--jobs 1] [--scaling SCALING.json]
+                           [--models MODEL ...] [--methods METHOD ...] [--jobs 1] [--scaling SCALING.json]
 
-The drives are like seq5, one for each number of images. A method isn't tried on more images once it has taken more
-than the limit, in CPU-seconds. As many methods as ``--jobs`` work side by side. ``--scaling`` adds the program's times
-on more images from `benchmarks.scaling` to the figure.
+The drives are like seq5, one for each number of images; ``--models`` names larger ones beside them. A method isn't
+tried on more images once it has taken more than the limit, in CPU-seconds. As many methods as ``--jobs`` work side by
+side. ``--scaling`` adds the program's times on more images from `benchmarks.scaling` to the figure.
 
 Coverage: keypoints that at least two images of one cluster see, projecting into them from within 38 m. Matchability:
 images of a cluster that see 20 common keypoints with at least two others of it. Both on every fourth keypoint.
@@ -44,7 +44,7 @@ _DRIVE = PRESETS["seq5"]
 
 @dataclass(frozen=True, kw_only=True)
 class _Town:
-    """A simulated drive."""
+    """A model of a simulated drive."""
 
     model_dir: Path
     num_images: int
@@ -81,13 +81,15 @@ def main() -> None:
     parser.add_argument("figure", type=Path)
     parser.add_argument("--limit-s", type=int, default=3600)
     parser.add_argument("--images", type=int, nargs="+", default=[250, 500, 1000, 2000, 4000, 8000, 12000])
+    parser.add_argument("--models", type=Path, nargs="*", default=[], help="COLMAP models, small to large")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--scaling", type=Path)
     arguments = parser.parse_args()
     rows: list[_Row] = []
     with tempfile.TemporaryDirectory(dir=arguments.output.parent) as scratch:
-        towns = [_write_town(wanted, Path(scratch) / str(wanted)) for wanted in sorted(arguments.images)]
+        drives = [_write_drive(wanted, Path(scratch) / str(wanted)) for wanted in sorted(arguments.images)]
+        towns = [_town(model_dir) for model_dir in (*drives, *arguments.models)]
 
         def run(method: str) -> None:
             for row in _run_method(method, towns, arguments.limit_s):
@@ -144,14 +146,18 @@ def _write_figure(path: Path, rows: list[_Row], scaling: Path | None) -> None:
     write_log_chart(path, series, x_title="images", y_title="CPU-seconds")
 
 
-def _write_town(wanted: int, folder: Path) -> _Town:
+def _write_drive(wanted: int, folder: Path) -> Path:
     num_keyframes = round(wanted / len(CAMERAS))
     num_points = round(_DRIVE.num_points * num_keyframes / _DRIVE.num_keyframes)
     write_drive(replace(_DRIVE, num_keyframes=num_keyframes, num_points=num_points), folder)
-    with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
-        store_scene(folder, Path(scratch))
-        seen = _seen_keypoints(open_scene(Path(scratch)))
-    return _Town(model_dir=folder, num_images=num_keyframes * len(CAMERAS), seen=seen)
+    return folder
+
+
+def _town(model_dir: Path) -> _Town:
+    with tempfile.TemporaryDirectory() as scratch:
+        store_scene(model_dir, Path(scratch))
+        scene = open_scene(Path(scratch))
+        return _Town(model_dir=model_dir, num_images=len(scene.image_names), seen=_seen_keypoints(scene))
 
 
 def _seen_keypoints(scene: PosedScene) -> csr_array:
