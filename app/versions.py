@@ -11,7 +11,7 @@ _VERSIONS = {
     "sfm": 1,
     "georegister": 2,
     "cluster": 1,
-    "select": 3,
+    "select": 4,
     "jobs": 1,
     "densify": 4,
     "fuse": 1,

@@ -153,7 +153,7 @@ def _relaxations(
     num_seen_by: NDArray[np.int64], n_match: int, wanted: int, num_usable: int, options: SelectionOptions
 ) -> tuple[str, ...]:
     relaxed = [
-        f"{count} points seen by {number} usable views instead of {options.n_vis}"
+        f"{count} of the points seen by {number} instead of {options.n_vis} usable views"
         for number, count in enumerate(num_seen_by)
         if count
     ]

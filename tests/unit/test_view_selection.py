@@ -93,10 +93,10 @@ def test_a_point_that_few_see_needs_all_of_them_and_it_is_said() -> None:
     side = make_scene(cameras | {"side.jpg": level_camera([9.5, -9.5, 1.5], 90)}, points)
     found = select_views(_problem(side), options)
     assert "side.jpg" in found.image_names
-    assert found.relaxed == ("1 points seen by 1 usable views instead of 2",)
+    assert found.relaxed == ("1 of the points seen by 1 instead of 2 usable views",)
     back = make_scene(cameras | {"back.jpg": level_camera([6, 0, 1.5], 180)}, points)
     found = select_views(_problem(back), options)
-    assert found.relaxed == ("1 points seen by 0 usable views instead of 2",)
+    assert found.relaxed == ("1 of the points seen by 0 instead of 2 usable views",)
     assert found.not_selected["matches fewer than 1 usable views"] == ("back.jpg",)
 
 
