@@ -14,7 +14,8 @@ CPU-seconds, user and system, of the depth maps alone, with the kernels compiled
 
 Scores are accuracy/completeness/F in % after thinning to 5 cm voxels: first over everything, then over surfaces with
 little texture alone: samples of `gt.ply` around which grey values deviate by less than 3 in the images that see them,
-and the points of the cloud whose nearest sample is one of those.
+and the points of the cloud whose nearest sample is one of those. Normals: of the points within 5 cm of the mesh, those
+whose normal is within 10 degrees of its, and the mean angle.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from numpy.typing import NDArray
 
 from benchmarks.dense_workspace import make_workspace
 from benchmarks.machine import describe_machine
-from benchmarks.surface_texture import nearest, texture_of_samples
+from benchmarks.surface_texture import nearest, normal_errors, texture_of_samples
 from fusion.cloud import PointCloud, read_ply
 from fusion.compare import cloud_distances, mesh_distances
 from fusion.depth_fusion import FusionOptions, fuse_depth_maps
@@ -45,6 +46,7 @@ from mvs_backends.patchmatch.options import PRESETS, PatchMatchOptions
 _THRESHOLDS_M = (0.02, 0.05, 0.1, 0.2)
 _VOXEL_M = 0.05
 _LITTLE_TEXTURE = 3.0
+_RIGHT_NORMAL_DEG = 10.0
 
 
 def main() -> None:
@@ -65,8 +67,8 @@ def main() -> None:
     print(describe_machine(), end="\n\n")
     first, last = (int(part) for part in arguments.frames.split("-"))
     heads = [f"{where}, {round(100 * t)} cm" for where in ("all", "little texture") for t in _THRESHOLDS_M]
-    print(f"| setting | CPU-s/MP | points | {' | '.join(heads)} |")
-    print("|---|---|---|" + "---|" * len(heads))
+    print(f"| setting | CPU-s/MP | points | {' | '.join(heads)} | normals |")
+    print("|---|---|---|" + "---|" * (len(heads) + 1))
     samples = thin(read_ply(arguments.truth / "gt.ply"), _VOXEL_M).points
     scored = np.array([[-1e9] * 3, [1e9] * 3])
     is_plain = np.zeros(0, np.bool_)
@@ -99,6 +101,8 @@ def main() -> None:
         cloud = fuse_depth_maps(job.workspace, job.workspace / "fused.ply", options=fusion, bounds=scored)
         found = _scores(cloud, samples, is_plain, arguments.truth / "gt_mesh.ply")
         cells = ["/".join(f"{100 * part:.1f}" for part in score) for score in found]
+        angles = normal_errors(cloud, arguments.truth / "gt_mesh.ply", _VOXEL_M)
+        cells.append(f"{np.mean(angles < _RIGHT_NORMAL_DEG):.1%}, {np.mean(angles):.1f}°")
         print(f"| {setting or 'preset'} | {cost:.1f} | {len(cloud):,} | {' | '.join(cells)} |", flush=True)
 
 

@@ -1,4 +1,4 @@
-"""How much texture the images show where a ground-truth sample of a surface lies."""
+"""Ground-truth surfaces: how much texture the images show of them, and whose normals are right."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import open3d as o3d
 import trimesh
 from numpy.typing import NDArray
 
+from fusion.cloud import PointCloud
 from mvs_backends.base import MvsJob
 
 _WINDOW_PX = 11
@@ -27,12 +28,7 @@ def texture_of_samples(job: MvsJob, samples: NDArray[np.float32], mesh: Path) ->
     Returns:
         (S,) in grey values of 0 to 255, in windows of 11 x 11 pixels; NaN for samples that no image sees.
     """
-    surface = trimesh.load_mesh(mesh, process=False)
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(
-        o3d.core.Tensor.from_numpy(np.asarray(surface.vertices, dtype=np.float32)),
-        o3d.core.Tensor.from_numpy(np.asarray(surface.faces, dtype=np.uint32)),
-    )
+    scene = _scene_of(mesh)
     texture = np.full((len(job.views), len(samples)), np.nan, np.float32)
     for number, view in enumerate(job.views):
         grey = cv2.imread(str(job.image_path(number)), cv2.IMREAD_GRAYSCALE).astype(np.float64)
@@ -55,6 +51,15 @@ def texture_of_samples(job: MvsJob, samples: NDArray[np.float32], mesh: Path) ->
     return result
 
 
+def normal_errors(cloud: PointCloud, mesh: Path, reach_m: float) -> NDArray[np.float32]:
+    """Angles in degrees between the normals of the points within reach of a mesh and those of its triangles."""
+    found = _scene_of(mesh).compute_closest_points(o3d.core.Tensor.from_numpy(cloud.points))
+    near = np.linalg.norm(found["points"].numpy() - cloud.points, axis=1) < reach_m
+    cosines = np.abs(np.sum(found["primitive_normals"].numpy() * cloud.normals, axis=1))[near]
+    angles: NDArray[np.float32] = np.degrees(np.arccos(np.minimum(cosines, 1)))
+    return angles
+
+
 def nearest(points: NDArray[np.float32], samples: NDArray[np.float32]) -> NDArray[np.int64]:
     """(P,) index of the sample nearest to each point."""
     search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor.from_numpy(samples))
@@ -63,3 +68,13 @@ def nearest(points: NDArray[np.float32], samples: NDArray[np.float32]) -> NDArra
         search.knn_search(o3d.core.Tensor.from_numpy(points), 1)[0].numpy()[:, 0].astype(np.int64)
     )
     return index
+
+
+def _scene_of(mesh: Path) -> o3d.t.geometry.RaycastingScene:
+    surface = trimesh.load_mesh(mesh, process=False)
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(
+        o3d.core.Tensor.from_numpy(np.asarray(surface.vertices, dtype=np.float32)),
+        o3d.core.Tensor.from_numpy(np.asarray(surface.faces, dtype=np.uint32)),
+    )
+    return scene
