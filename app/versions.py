@@ -13,7 +13,7 @@ _VERSIONS = {
     "cluster": 1,
     "select": 4,
     "jobs": 1,
-    "densify": 4,
+    "densify": 5,
     "fuse": 1,
 }
 

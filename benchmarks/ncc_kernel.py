@@ -61,7 +61,6 @@ def main() -> None:
     nothing = np.zeros((0, 12), np.float32)
     sources = Sources(
         warp=warp,
-        centers=np.zeros((4, 3), np.float32),
         texels=packed,
         first=np.zeros(4, np.uint64),
         width=np.full(4, width, np.int32),

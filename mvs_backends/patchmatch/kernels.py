@@ -19,7 +19,6 @@ from mvs_backends.patchmatch.cost.kernels import (
     COMPILED,
     MAX_COST,
     MIN_VARIANCE,
-    angle_factor,
     facing,
     geometric_error,
     px_per_inverse_depth,
@@ -68,7 +67,7 @@ class Search(NamedTuple):
 
     seed: int
     iteration: int
-    """Counts on over the sweeps of a stage; alters the random numbers and tightens the thresholds."""
+    """Counts on over the sweeps of a level; alters the random numbers and tightens the thresholds."""
     max_views: int
     """Views that the cost of a hypothesis is averaged over, at most."""
     geometric_weight: np.float32
@@ -79,8 +78,6 @@ class Search(NamedTuple):
     """Largest shift of a refined hypothesis in the source view."""
     normal_perturbation: np.float32
     """Largest change of each component of a refined unit normal."""
-    min_angle_rad: np.float32
-    """Triangulation angle below which a view loses weight."""
     random_depth: int
     """1: also try a hypothesis from the whole interval."""
 
@@ -209,13 +206,13 @@ def _least_cost_view(count, num_views, costs):
 
 
 @njit(forceinline=True, **COMPILED)
-def _select_views(x, y, w, count, previous, reference, sources, search, scratch):
+def _select_views(count, previous, search, scratch):
     """Multi-hypothesis joint view selection (ACMM).
 
     Writes the views' weights and the best of them, best first, into scratch. Returns how many are chosen, at least one.
     """
     costs, multiplicity, weights, chosen = scratch.costs, scratch.multiplicity, scratch.weights, scratch.chosen
-    num_views = sources.warp.shape[0]
+    num_views = len(weights)
     sweep = np.float32(search.iteration)
     good_cost = _GOOD_COST * np.exp(-sweep * sweep / _GOOD_COST_DECAY)
     for j in range(num_views):
@@ -234,8 +231,6 @@ def _select_views(x, y, w, count, previous, reference, sources, search, scratch)
                 weights[j] *= _TWO
         elif j == previous:
             weights[j] = np.float32(0.2)
-        if weights[j] > _ZERO and search.min_angle_rad > _ZERO:
-            weights[j] *= angle_factor(j, x, y, w, sources.centers, reference.intrinsics, search.min_angle_rad)
     num_chosen = 0
     for k in range(min(search.max_views, num_views)):
         best, best_weight = -1, np.float32(1e-6)
@@ -359,7 +354,7 @@ def _update_pixel(x, y, variance, state, reference, sources, window, search, scr
         w, a, b = candidates[i, 0], candidates[i, 1], candidates[i, 2]
         for j in range(num_views):
             costs[i, j] = view_cost(j, x, y, w, a, b, variance, sources, window, scratch)
-    num_chosen = _select_views(x, y, own, count, state.best_view[y, x], reference, sources, search, scratch)
+    num_chosen = _select_views(count, state.best_view[y, x], search, scratch)
     cost = _compare_candidates(x, y, count, num_chosen, sources, search, scratch)
     draw = _seed(search.seed, search.iteration, y * state.cost.shape[1] + x)
     for kind in range(5):

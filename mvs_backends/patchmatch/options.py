@@ -15,27 +15,27 @@ class PatchMatchOptions:
     """Source views per reference view."""
     max_cost_views: int = 4
     """The cost of a hypothesis is averaged over the best of the source views, at most so many. ACMM: all."""
-    iterations: tuple[int, ...] = (6, 3, 2)
-    """Sweeps per level, coarse to fine; each level halves the pixel size."""
+    iterations: tuple[int, ...] = (6, 3, 1)
+    """Photometric sweeps per level, coarse to fine; each level halves the pixel size."""
+    geometric_iterations: int = 1
+    """Sweeps after those, at the finest level, whose cost has the forward-backward reprojection error against the maps
+    of the source views (ACMM's geometric consistency). 0: none."""
     finest_level: int = 0
     """Halvings of the image at which the search ends; its maps are upsampled."""
     planar_prior: bool = True
     """Fit planes to the credible pixels of evenly coloured regions, and give them to the others there."""
     num_random: int = 8
     """Random hypotheses per pixel at the start, beside the one interpolated from sparse points. ACMM: 1."""
-    geometric_weight: float = 0.0
-    """Weight lambda of the forward-backward reprojection error in the cost. ACMM: 0.2. Against the coarser maps of the
-    pass before, it costs accuracy; views are made consistent by `average_views` and by the planar prior."""
+    geometric_weight: float = 0.2
+    """Weight lambda of the reprojection error. ACMM: 0.2."""
     max_geometric_error_px: float = 3.0
     """Truncation delta of the reprojection error. ACMM: 3."""
     sigma_space_px: float = 5.0
     """Bilateral weight: spread over distance. ACMM: 5."""
     sigma_grey: float = 20.0
     """Bilateral weight: spread over grey values of 0 to 255. ACMM: 3 for COLMAP-like weights."""
-    min_angle_deg: float = 1.5
-    """Source views with a smaller triangulation angle lose weight quadratically. 0: no."""
-    max_cost: float = 0.5
-    """Pixels of a larger final cost get no depth."""
+    max_cost: float = 0.65
+    """Pixels of a larger final cost, reprojection error included, get no depth."""
     max_prior_cost: float = 0.15
     """Pixels of at most this cost, whose depth two source views confirm, support the planar prior. ACMP: 0.1."""
     smoothing_radius_px: int = 2
@@ -50,8 +50,8 @@ class PatchMatchOptions:
             if getattr(self, field) < 1:
                 raise ValueError(f"{field} must be at least 1, not {getattr(self, field)}")
         for field in (
+            "geometric_iterations",
             "geometric_weight",
-            "min_angle_deg",
             "max_prior_cost",
             "smoothing_radius_px",
             "min_speckle_px",
@@ -66,9 +66,9 @@ class PatchMatchOptions:
 
 
 PRESETS = {
-    Preset.PREVIEW: PatchMatchOptions(num_source_views=4, max_cost_views=3, iterations=(5, 3), finest_level=1),
+    Preset.PREVIEW: PatchMatchOptions(num_source_views=4, max_cost_views=3, iterations=(5, 2), finest_level=1),
     Preset.NORMAL: PatchMatchOptions(),
-    Preset.HIGH: PatchMatchOptions(num_source_views=9, max_cost_views=6, iterations=(8, 5, 4)),
+    Preset.HIGH: PatchMatchOptions(num_source_views=9, max_cost_views=6, iterations=(8, 5, 3), geometric_iterations=2),
 }
 
 

@@ -52,6 +52,17 @@ class Pass:
 
 
 @dataclass(frozen=True, kw_only=True)
+class _Search:
+    """One search over all views."""
+
+    level: int
+    sweeps: range
+    """Numbered on over the searches of a level."""
+    is_geometric: bool
+    """Goes on at the level of the search before, with the maps of all views that it left."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Passes:
     """All passes of a job. Each reads what earlier ones left for all views, so the order of views doesn't matter."""
 
@@ -66,19 +77,34 @@ class Passes:
     def in_order(self) -> Sequence[Pass]:
         """What there is to do, one after the other.
 
-        Coarse to fine, each level is searched, then (for the planar prior) its credible pixels are found, which needs
-        the maps of all views; the finest level's maps get planes and are smoothed, and at last averaged and written.
+        Coarse to fine, each level is searched, the finest once more with the maps of all views in the cost; after each
+        search (for the planar prior) its credible pixels are found, which needs the maps of all views as well. The last
+        maps get planes and are smoothed, and at last averaged and written.
         """
-        sweeps = [count / 4.0 ** self._level(number) for number, count in enumerate(self.options.iterations)]
+        costs = [len(search.sweeps) / 4.0**search.level for search in self._searches]
         passes = []
-        for number, cost in enumerate(sweeps):
+        for number, cost in enumerate(costs):
             passes.append(self._kept_pass(_searched(number), cost, partial(self._search, number)))
             if self.options.planar_prior:
                 passes.append(self._kept_pass(_credible(number), cost / 10, partial(self._find_credible, number)))
-        passes.append(self._kept_pass(_FINISHED, sweeps[-1] / 10, self._finish))
-        passes.append(Pass(share=sweeps[-1] / 10, is_done=partial(has_maps, self.job), run=self._write))
+        passes.append(self._kept_pass(_FINISHED, costs[-1] / 10, self._finish))
+        passes.append(Pass(share=costs[-1] / 10, is_done=partial(has_maps, self.job), run=self._write))
         total = sum(part.share for part in passes)
         return [replace(part, share=part.share / total) for part in passes]
+
+    @property
+    def _searches(self) -> Sequence[_Search]:
+        options = self.options
+        coarsest = options.finest_level + len(options.iterations) - 1
+        searches = [
+            _Search(level=coarsest - number, sweeps=range(count), is_geometric=False)
+            for number, count in enumerate(options.iterations)
+        ]
+        if options.geometric_iterations:
+            first = options.iterations[-1]
+            sweeps = range(first, first + options.geometric_iterations)
+            searches.append(_Search(level=options.finest_level, sweeps=sweeps, is_geometric=True))
+        return searches
 
     def _kept_pass(self, name: str, share: float, find: Callable[[int], Arrays]) -> Pass:
         def run(view: int) -> None:
@@ -93,40 +119,41 @@ class Passes:
         return Pass(share=share, is_done=lambda view: self._kept_in(name, view).exists(), run=run)
 
     def _search(self, number: int, view: int) -> Arrays:
-        """Hypotheses of a level, from random ones or from those of the level before."""
-        level = self._level(number)
-        with_maps = number > 0 and self.options.geometric_weight > 0
-        search = self._level_search(view, level, number, maps_of=number - 1 if with_maps else None)
-        camera = level_camera(self.job.views[view], level)
+        """Hypotheses of a search, from random ones or from those of the search before."""
+        this = self._searches[number]
+        search = self._level_search(view, number, maps_of=number - 1 if this.is_geometric else None)
+        camera = level_camera(self.job.views[view], this.level)
         if search is None:
             return _arrays(_nothing(camera))
         if number == 0:
             points, inverse_depths = sparse_points_in_image(self.job, view, camera)
             start = search.start(interpolated_planes(points, inverse_depths, camera.width, camera.height))
         else:
-            coarse_grey, _ = self.images.get(view, self._level(number - 1))
-            start = upsampled(self._hypotheses(_searched(number - 1), view), coarse_grey, search.reference)
+            start = self._hypotheses(_searched(number - 1), view)
+            if not this.is_geometric:
+                coarse_grey, _ = self.images.get(view, self._level(number - 1))
+                start = upsampled(start, coarse_grey, search.reference)
             if self.options.planar_prior:
                 start = self._with_planes(search, start, view, camera, number - 1)
-        return _arrays(search.sweep(start, self.options.iterations[number], random_depth=number == 0))
+        return _arrays(search.sweep(start, this.sweeps, random_depth=number == 0))
 
     def _find_credible(self, number: int, view: int) -> Arrays:
         """Pixels whose depth is to be relied upon."""
-        search = self._level_search(view, self._level(number), number, maps_of=number)
+        search = self._level_search(view, number, maps_of=number)
         found = self._hypotheses(_searched(number), view)
         credible = search.credible(found) if search else np.zeros(found.cost.shape, np.bool_)
         return {"credible": credible}
 
     def _finish(self, view: int) -> Arrays:
-        """The finest level's hypotheses with planes, smoothed, those of high cost removed."""
-        last = len(self.options.iterations) - 1
-        level = self._level(last)
-        search = self._level_search(view, level, last, maps_of=None)
+        """The last hypotheses with planes, smoothed, those of high cost removed."""
+        last = len(self._searches) - 1
         found = self._hypotheses(_searched(last), view)
+        search = self._level_search(view, last, maps_of=None)
         if search is None:
             return _arrays(found)
         if self.options.planar_prior:
-            found = self._with_planes(search, found, view, level_camera(self.job.views[view], level), last)
+            camera = level_camera(self.job.views[view], self._level(last))
+            found = self._with_planes(search, found, view, camera, last)
         if self.options.smoothing_radius_px > 0:
             found = search.smoothed(found, self.options.smoothing_radius_px)
         found.plane[~(found.cost <= self.options.max_cost)] = 0.0
@@ -181,8 +208,9 @@ class Passes:
         here = cv2.resize(credible, size, interpolation=cv2.INTER_NEAREST).astype(np.bool_)
         return search.with_planes(found, here, np.concatenate(points))
 
-    def _level_search(self, view: int, level: int, number: int, maps_of: int | None) -> LevelSearch | None:
-        """The search of a view at a level with the maps of an earlier pass; None if there is nothing to search."""
+    def _level_search(self, view: int, number: int, maps_of: int | None) -> LevelSearch | None:
+        """A search of a view with the maps that a search left; None if there is nothing to search."""
+        level = self._level(number)
         reference, sources = self._reference(view, level), self._sources(view)
         if not sources or not (reference.inverse_range[..., 1] > 0).any():
             return None
@@ -218,7 +246,7 @@ class Passes:
         )
 
     def _level(self, number: int) -> int:
-        return self.options.finest_level + len(self.options.iterations) - 1 - number
+        return self._searches[number].level
 
     def _kept_in(self, name: str, view: int) -> Path:
         return self.folder / f"{name}_view{view:05d}"

@@ -117,8 +117,6 @@ def gather_sources(
     reference = level_camera(job.views[view], level)
     cameras = [level_camera(job.views[s], level) for s in sources]
     packed = [images.get(s, level)[1] for s in sources]
-    to_reference = job.views[view].cam_from_world
-    centers = [to_reference[:, :3] @ c.center_in_world + to_reference[:, 3] for c in cameras]
     planes = [np.zeros((0, 3), np.float32)]
     sizes, to_map, from_map = [], [], []
     for s in sources if maps is not None else ():
@@ -130,7 +128,6 @@ def gather_sources(
         from_map.append(warp(reference, camera))
     return Sources(
         warp=np.stack([warp(c, reference) for c in cameras]),
-        centers=np.array(centers, np.float32),
         texels=np.concatenate(packed),
         first=np.cumsum([0, *(p.size for p in packed[:-1])]).astype(np.uint64),
         width=np.array([c.width for c in cameras], np.int32),
@@ -178,7 +175,6 @@ class LevelSearch:
             max_geometric_px=np.float32(options.max_geometric_error_px),
             perturbation_px=np.float32(max(2.0 * shrink, 0.3)),
             normal_perturbation=np.float32(max(0.5 * shrink, 0.06)),
-            min_angle_rad=np.float32(np.deg2rad(options.min_angle_deg)),
             random_depth=int(random_depth),
         )
 
@@ -193,16 +189,16 @@ class LevelSearch:
         self._over_bands(initialise_rows, self.options.num_random, state, search)
         return Hypotheses(plane=state.plane, cost=state.cost, view=state.best_view)
 
-    def sweep(self, start: Hypotheses, iterations: int, random_depth: bool) -> Hypotheses:
-        """Improve hypotheses by so many sweeps over the image.
+    def sweep(self, start: Hypotheses, iterations: range, random_depth: bool) -> Hypotheses:
+        """Improve hypotheses by sweeps over the image.
 
         Args:
             start: what to improve; it stays as it is.
-            iterations: how many sweeps; later ones search less widely.
+            iterations: numbers of the sweeps of this level; later ones search less widely.
             random_depth: whether to try depths from the whole interval as well.
         """
         state = State(plane=start.plane.copy(), cost=start.cost.copy(), best_view=start.view.copy())
-        for iteration in range(iterations):
+        for iteration in iterations:
             search = self._search(iteration, random_depth)
             for colour in (0, 1):
                 self._over_bands(sweep_rows, colour, state, search)

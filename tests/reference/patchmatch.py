@@ -114,25 +114,15 @@ def patch_cost(reference: Camera, source: Camera, x: int, y: int, plane: Array, 
 def reprojection_error(
     reference: Camera, source: Camera, source_plane: Array, x: float, y: float, w: float, cap: float
 ) -> float:
-    """Capped forward-backward error e as e^2 / (1 + e); `source_plane` (H, W, 3) is the source's map."""
-    worst = cap**2 / (1 + cap)
+    """Capped forward-backward error; `source_plane` (H, W, 3) is the source's map."""
     u, v, depth = project(source, point_on_plane(reference, x, y, np.array([w, 0, 0]), (x, y)))
     column, row = math.floor(u + 0.5), math.floor(v + 0.5)
     height, width = source_plane.shape[:2]
     if depth <= 0 or not (0 <= column < width and 0 <= row < height) or source_plane[row, column, 0] <= 0:
-        return worst
+        return cap
     back = point_on_plane(source, u, v, source_plane[row, column], (column, row))
     bx, by, depth = project(reference, back)
-    error = min(math.hypot(bx - x, by - y), cap)
-    return worst if depth <= 0 else error**2 / (1 + error)
-
-
-def triangulation_factor(reference: Camera, source: Camera, x: int, y: int, w: float, min_angle: float) -> float:
-    """min(1, (sin angle / min_angle)^2) between the rays to the point, a thousandth added."""
-    point = point_on_plane(reference, x, y, np.array([w, 0, 0]), (x, y))
-    rays = [point + camera.pose[:, :3].T @ camera.pose[:, 3] for camera in (reference, source)]
-    sine = np.linalg.norm(np.cross(*rays)) / np.prod([np.linalg.norm(ray) for ray in rays])
-    return min(sine**2 / min_angle**2 + 1e-3, 1.0)
+    return cap if depth <= 0 else min(math.hypot(bx - x, by - y), cap)
 
 
 def smoothed(plane: Array, rate: Array, radius: int) -> Array:

@@ -25,7 +25,6 @@ class Settings:
     max_geometric_px: float
     perturbation_px: float
     normal_perturbation: float
-    min_angle_rad: float
     random_depth: int
 
 
@@ -113,12 +112,9 @@ def merged(candidates: Array, rate: float) -> tuple[Array, NDArray[np.int64]]:
     return np.array(kept), np.array(counts)
 
 
-def chosen_views(views: Views, x: int, y: int, w: float, costs: Array, previous: int, settings: Settings) -> Array:
+def chosen_views(costs: Array, previous: int, settings: Settings) -> Array:
     """(N,) the views' weights, all but the largest `max_views` set to 0; costs (C, N) of hypotheses in views."""
     weights = plain.view_weights(costs, previous, settings.iteration)
-    if settings.min_angle_rad > 0:
-        for j, source in enumerate(views.sources):
-            weights[j] *= plain.triangulation_factor(views.reference, source, x, y, w, settings.min_angle_rad)
     order = np.argsort(-weights, kind="stable")
     weights[weights <= 1e-6] = 0
     weights[order[settings.max_views :]] = 0
@@ -177,7 +173,7 @@ def updated_pixel(views: Views, maps: Maps, x: int, y: int, settings: Settings) 
     candidates, counts = merged(candidates, rate)
     costs = np.array([[views.cost(j, x, y, c) for j in range(len(views.sources))] for c in candidates])
     repeated = np.repeat(costs, counts, axis=0)
-    weights = chosen_views(views, x, y, own, repeated, int(maps.view[y, x]), settings)
+    weights = chosen_views(repeated, int(maps.view[y, x]), settings)
     totals = [total_cost(views, x, y, c[0], row, weights, settings) for c, row in zip(candidates, costs, strict=True)]
     best, least = candidates[np.argmin(totals)], min(totals)
     draw = first_state(settings.seed, settings.iteration, y * maps.cost.shape[1] + x)

@@ -114,12 +114,9 @@ def _for_kernels(cameras: list[plain.Camera], maps: NDArray[np.float32]) -> Scen
     for camera, out in zip(cameras[1:], packed, strict=True):
         cost.pack_neighbours(camera.grey, out)
     to_source = np.stack([warp(level, levels[0]) for level in levels[1:]])
-    pose = cameras[0].pose
-    centers = [pose[:, :3] @ level.center_in_world + pose[:, 3] for level in levels[1:]]
     size = WIDTH * HEIGHT
     sources = cost.Sources(
         warp=to_source,
-        centers=np.array(centers, np.float32),
         texels=packed.ravel(),
         first=np.arange(NUM_SOURCES).astype(np.uint64) * np.uint64(size),
         width=np.full(NUM_SOURCES, WIDTH, np.int32),

@@ -92,6 +92,21 @@ def test_a_bare_wall_gets_the_plane_of_the_edges_that_other_views_find(tmp_path:
     assert np.mean(off[middle > 0] < 0.01) > 0.95
 
 
+def test_maps_of_other_views_remove_what_only_one_view_sees(tmp_path: Path) -> None:
+    """Without what else removes outliers: ACMM's geometric consistency alone."""
+    alone = dataclasses.replace(QUICK, planar_prior=False, average_views=False, smoothing_radius_px=0, min_speckle_px=0)
+    direction = np.asarray(SLANTED) / np.linalg.norm(SLANTED)
+    off = {}
+    for weight in (0.0, 0.2):
+        job = plane_job(tmp_path / str(weight), normal=SLANTED)
+        estimate_maps(job=job, options=dataclasses.replace(alone, geometric_weight=weight), seed=0, num_threads=2)
+        depths = np.stack([depth for depth, _ in maps(job)])
+        truth = np.stack([true_depth(view, direction, 5.0) for view in job.views])
+        off[weight] = np.abs(depths / truth - 1)[depths > 0]
+    assert np.mean(off[0.2] > 0.03) < 0.3 * np.mean(off[0.0] > 0.03)
+    assert np.median(off[0.2]) < np.median(off[0.0])
+
+
 def test_seed_changes_the_search_and_not_the_surface(tmp_path: Path) -> None:
     one, two = (plane_job(tmp_path / name, normal=SLANTED) for name in ("one", "two"))
     first, second = run(one), run(two, options=MvsOptions(seed=5))

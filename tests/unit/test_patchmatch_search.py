@@ -19,11 +19,10 @@ SETTINGS = plain.Settings(
     seed=7,
     iteration=2,
     max_views=2,
-    geometric_weight=0.05,
+    geometric_weight=0.2,
     max_geometric_px=3.0,
     perturbation_px=1.5,
     normal_perturbation=0.3,
-    min_angle_rad=0.05,
     random_depth=1,
 )
 TWINS = {
@@ -32,7 +31,6 @@ TWINS = {
     "view_cost": patchmatch.patch_cost,
     "geometric_error": patchmatch.reprojection_error,
     "px_per_inverse_depth": patchmatch.px_per_inverse_depth,
-    "angle_factor": patchmatch.triangulation_factor,
     "facing": patchmatch.normal_of,
     "upsample": patchmatch.upsampled,
     "smooth_rows": patchmatch.smoothed,
@@ -110,7 +108,7 @@ def test_turned_planes() -> None:
     [
         (0, 0, {}),
         (1, 1, {"seed": 123456789012, "iteration": 8, "max_views": 1}),
-        (2, 0, {"iteration": 0, "max_views": 3, "geometric_weight": 0.0, "min_angle_rad": 0.0, "random_depth": 0}),
+        (2, 0, {"iteration": 0, "max_views": 3, "geometric_weight": 0.0, "random_depth": 0}),
     ],
     ids=["geometric", "late", "photometric"],
 )

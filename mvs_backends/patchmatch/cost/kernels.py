@@ -63,8 +63,6 @@ class Sources(NamedTuple):
 
     warp: NDArray[np.float32]
     """(N, 12) A (row by row) and k: reference pixel and inverse depth to homogeneous source pixel."""
-    centers: NDArray[np.float32]
-    """(N, 3) projection centres in the reference camera's frame."""
     texels: NDArray[np.uint32]
     """(T,) all images; each element packs the 2 x 2 neighbourhood to the right and below."""
     first: NDArray[np.uint64]
@@ -74,7 +72,7 @@ class Sources(NamedTuple):
     limit: NDArray[np.float32]
     """(N, 2) largest x and y at which the neighbourhood is whole."""
     planes: NDArray[np.float32]
-    """(M, 3) all hypothesis maps of the previous pass; (0, 3) in a photometric pass."""
+    """(M, 3) all hypothesis maps of the pass before; (0, 3) in a photometric pass."""
     plane_first: NDArray[np.uint64]
     """(N,)"""
     plane_size: NDArray[np.int32]
@@ -259,38 +257,33 @@ def view_cost(j, pixel_x, pixel_y, w, a, b, variance, sources, window, scratch):
 
 @njit(forceinline=True, **COMPILED)
 def geometric_error(j, x, y, w, sources, cap):
-    """Forward-backward reprojection error e in reference pixels, at most `cap` (ACMM), as e^2 / (1 + e).
-
-    Flat at 0, unlike ACMM's: the maps of the pass before, half as fine, must not pull the depth within a pixel.
-    """
-    worst = cap * cap / (_ONE + cap)
+    """Forward-backward reprojection error in reference pixels, at most `cap` (ACMM)."""
     t = sources.to_map[j]
     fx, fy = np.float32(x), np.float32(y)
     z = t[6] * fx + t[7] * fy + t[8] + t[11] * w
     if z <= _TINY:
-        return worst
+        return cap
     z = _ONE / z
     mx = (t[0] * fx + t[1] * fy + t[2] + t[9] * w) * z
     my = (t[3] * fx + t[4] * fy + t[5] + t[10] * w) * z
     width, height = sources.plane_size[j, 0], sources.plane_size[j, 1]
     if mx < -_HALF or my < -_HALF or mx > np.float32(width) - _HALF or my > np.float32(height) - _HALF:
-        return worst
+        return cap
     ix, iy = min(np.int32(mx + _HALF), width - 1), min(np.int32(my + _HALF), height - 1)
     index = sources.plane_first[j] + np.uint64(iy * width + ix)
     there = sources.planes[index, 0]
     if there <= _ZERO:
-        return worst
+        return cap
     # The source's own plane, not the nearest pixel's depth: on a slanted road the two differ by more than the cap.
     there += sources.planes[index, 1] * (mx - np.float32(ix)) + sources.planes[index, 2] * (my - np.float32(iy))
     r = sources.from_map[j]
     z = r[6] * mx + r[7] * my + r[8] + r[11] * there
     if z <= _TINY:
-        return worst
+        return cap
     z = _ONE / z
     ex = (r[0] * mx + r[1] * my + r[2] + r[9] * there) * z - fx
     ey = (r[3] * mx + r[4] * my + r[5] + r[10] * there) * z - fy
-    error = min(np.sqrt(ex * ex + ey * ey), cap)
-    return error * error / (_ONE + error)
+    return min(np.sqrt(ex * ex + ey * ey), cap)
 
 
 @njit(forceinline=True, **COMPILED)
@@ -309,22 +302,6 @@ def px_per_inverse_depth(j, x, y, w, warp):
     py = (t[3] * fx + t[4] * fy + t[5] + t[10] * w) * z
     mx, my = (t[9] - px * t[11]) * z, (t[10] - py * t[11]) * z
     return np.sqrt(mx * mx + my * my)
-
-
-@njit(forceinline=True, **COMPILED)
-def angle_factor(j, x, y, w, centers, intrinsics, min_angle):
-    """(0, 1]: falls off quadratically below the smallest triangulation angle that is worth much, `min_angle` radians.
-
-    `centers` (N, 3) in the reference camera's frame, `intrinsics` (4,) fx, fy, cx, cy in pixels.
-    """
-    rx = (np.float32(x) - intrinsics[2]) / intrinsics[0]
-    ry = (np.float32(y) - intrinsics[3]) / intrinsics[1]
-    # Scaled by w, so that a far point needs no large numbers: the point is r, the centre c w.
-    cx, cy, cz = centers[j, 0] * w, centers[j, 1] * w, centers[j, 2] * w
-    dx, dy, dz = rx - cx, ry - cy, _ONE - cz
-    kx, ky, kz = ry * dz - dy, dx - rx * dz, rx * dy - ry * dx
-    sine = (kx * kx + ky * ky + kz * kz) / ((rx * rx + ry * ry + _ONE) * (dx * dx + dy * dy + dz * dz))
-    return min(sine / (min_angle * min_angle) + np.float32(1e-3), _ONE)
 
 
 @njit(forceinline=True, **COMPILED)

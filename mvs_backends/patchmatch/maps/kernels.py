@@ -24,8 +24,6 @@ _HALF = np.float32(0.5)
 _ONE = np.float32(1)
 _TWO = np.float32(2)
 _TINY = np.float32(1e-12)
-# e^2 / (1 + e) at one pixel.
-_MAX_GEOMETRIC_TERM = np.float32(0.5)
 _DISTINCT_STEP_PX, _DISTINCT_COST = np.float32(2), np.float32(0.1)
 _MIN_CONFIRMING = 2
 # Of a plane that the ray nearly lies in.
@@ -128,7 +126,7 @@ def credible_rows(first_row, last_row, wanted, plane, max_cost, reference, sourc
                 continue
             confirming = 0
             for j in range(sources.warp.shape[0]):
-                if geometric_error(j, x, y, w, sources, _TWO) > _MAX_GEOMETRIC_TERM:
+                if geometric_error(j, x, y, w, sources, _TWO) > _ONE:
                     continue
                 cost = view_cost(j, x, y, w, a, b, variance, sources, window, scratch)
                 if cost > max_cost:
