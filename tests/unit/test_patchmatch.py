@@ -19,6 +19,7 @@ from mvs_backends.base import MvsError, MvsJob, MvsOptions, Preset
 from mvs_backends.patchmatch.backend import estimate_maps
 from mvs_backends.patchmatch.images import ImageCache, kept_bytes
 from mvs_backends.patchmatch.options import PatchMatchOptions
+from mvs_backends.patchmatch.search import Hypotheses, LevelSearch
 from tests.reference.colmap_maps import read_map
 from tests.reference.plane_scene import plane_job, true_depth
 
@@ -105,6 +106,30 @@ def test_maps_of_other_views_remove_what_only_one_view_sees(tmp_path: Path) -> N
         off[weight] = np.abs(depths / truth - 1)[depths > 0]
     assert np.mean(off[0.2] > 0.03) < 0.3 * np.mean(off[0.0] > 0.03)
     assert np.median(off[0.2]) < np.median(off[0.0])
+
+
+def test_searches_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Coarse to fine, depths from the whole interval at the coarsest only, at last with the maps of the sources."""
+    searches = []
+    sweep = LevelSearch.sweep
+
+    def recorded(self: LevelSearch, start: Hypotheses, iterations: range, random_depth: bool) -> Hypotheses:
+        searches.append((start.cost.shape, iterations, random_depth, len(self.sources.plane_size)))
+        return sweep(self, start, iterations, random_depth)
+
+    monkeypatch.setattr(LevelSearch, "sweep", recorded)
+    job = plane_job(tmp_path, normal=SLANTED, num_views=3)
+    options = dataclasses.replace(QUICK, iterations=(3, 2, 1), geometric_iterations=2)
+    estimate_maps(job=job, options=options, seed=0, num_threads=1)
+    height, width = job.views[0].height, job.views[0].width
+    coarse, middle, fine = ((height // 4, width // 4), (height // 2, width // 2), (height, width))
+    once = [
+        (coarse, range(3), True, 0),
+        (middle, range(2), False, 0),
+        (fine, range(1), False, 0),
+        (fine, range(1, 3), False, 2),
+    ]
+    assert searches == [search for search in once for _ in job.views]
 
 
 def test_seed_changes_the_search_and_not_the_surface(tmp_path: Path) -> None:
