@@ -58,18 +58,15 @@ def main() -> None:
     packed = np.empty(grey.size, np.uint32)
     pack_neighbours(grey, packed)
     warp = np.array([[1.01, 0.02, i, 0.01, 0.99, 1, 1e-5, 1e-5, 1, 50, 0, 0.1] for i in range(4)], np.float32)
-    nothing = np.zeros((0, 12), np.float32)
     sources = Sources(
         warp=warp,
         texels=packed,
         first=np.zeros(4, np.uint64),
         width=np.full(4, width, np.int32),
+        height=np.full(4, height, np.int32),
         limit=np.tile(np.array([width - 1.01, height - 1.01], np.float32), (4, 1)),
         planes=np.zeros((0, 3), np.float32),
-        plane_first=np.zeros(0, np.uint64),
-        plane_size=np.zeros((0, 2), np.int32),
-        to_map=nothing,
-        from_map=nothing,
+        warp_back=warp,
     )
     matching, scratch = window(PatchMatchOptions()), new_scratch(4)
     padded = np.pad(grey, PADDING, mode="edge")

@@ -214,7 +214,7 @@ class Passes:
         reference, sources = self._reference(view, level), self._sources(view)
         if not sources or not (reference.inverse_range[..., 1] > 0).any():
             return None
-        maps = None if maps_of is None else partial(self._map, maps_of)
+        maps = None if maps_of is None else partial(self._kept, _searched(maps_of), field="plane")
         return LevelSearch(
             reference=reference,
             sources=gather_sources(self.job, view, sources, level, self.images, maps),
@@ -223,10 +223,6 @@ class Passes:
             seed=self.seed + 1000003 * view + 7919 * number,
             executor=self.executor,
         )
-
-    def _map(self, number: int, view: int) -> tuple[NDArray[np.float32], int]:
-        """A view's planes from a search, and their level."""
-        return self._kept(_searched(number), view, "plane"), self._level(number)
 
     def _sources(self, view: int) -> list[int]:
         # By index: nothing depends on the order in which a job names them.

@@ -102,7 +102,7 @@ def gather_sources(
     sources: Sequence[int],
     level: int,
     images: ImageCache,
-    maps: Callable[[int], tuple[NDArray[np.float32], int]] | None,
+    maps: Callable[[int], NDArray[np.float32]] | None,
 ) -> Sources:
     """Images, cameras and, with `maps`, the hypotheses of the source views as flat arrays for the kernels.
 
@@ -112,31 +112,26 @@ def gather_sources(
         sources: its source views.
         level: how often all images are halved.
         images: where images come from.
-        maps: gives a view's hypothesis map and the level that it has.
+        maps: gives a view's hypotheses at that level.
     """
     reference = level_camera(job.views[view], level)
     cameras = [level_camera(job.views[s], level) for s in sources]
     packed = [images.get(s, level)[1] for s in sources]
-    planes = [np.zeros((0, 3), np.float32)]
-    sizes, to_map, from_map = [], [], []
-    for s in sources if maps is not None else ():
-        plane, map_level = maps(s) if maps is not None else (planes[0], 0)
-        camera = level_camera(job.views[s], map_level)
-        planes.append(plane.reshape(-1, 3))
-        sizes.append((camera.width, camera.height))
-        to_map.append(warp(camera, reference))
-        from_map.append(warp(reference, camera))
+    first = np.cumsum([0, *(p.size for p in packed)])
+    planes = np.empty((first[-1] if maps else 0, 3), np.float32)
+    if maps:
+        # One after the other: two copies of all would not fit beside large images.
+        for s, begin, end in zip(sources, first, first[1:], strict=False):
+            planes[begin:end] = maps(s).reshape(-1, 3)
     return Sources(
         warp=np.stack([warp(c, reference) for c in cameras]),
         texels=np.concatenate(packed),
-        first=np.cumsum([0, *(p.size for p in packed[:-1])]).astype(np.uint64),
+        first=first[:-1].astype(np.uint64),
         width=np.array([c.width for c in cameras], np.int32),
+        height=np.array([c.height for c in cameras], np.int32),
         limit=np.array([(c.width - 1.01, c.height - 1.01) for c in cameras], np.float32),
-        planes=np.concatenate(planes),
-        plane_first=np.cumsum([0, *(p.shape[0] for p in planes[1:-1])]).astype(np.uint64),
-        plane_size=np.array(sizes, np.int32).reshape(-1, 2),
-        to_map=np.array(to_map, np.float32).reshape(-1, 12),
-        from_map=np.array(from_map, np.float32).reshape(-1, 12),
+        planes=planes,
+        warp_back=np.stack([warp(reference, c) for c in cameras]),
     )
 
 
@@ -164,7 +159,7 @@ class LevelSearch:
 
     def _search(self, iteration: int, random_depth: bool) -> Search:
         options = self.options
-        geometric = len(self.sources.plane_size) > 0
+        geometric = len(self.sources.planes) > 0
         # Wide at first, below a tenth of a pixel at last.
         shrink = 0.5 ** (iteration if random_depth else iteration + 1)
         return Search(

@@ -120,12 +120,10 @@ def _for_kernels(cameras: list[plain.Camera], maps: NDArray[np.float32]) -> Scen
         texels=packed.ravel(),
         first=np.arange(NUM_SOURCES).astype(np.uint64) * np.uint64(size),
         width=np.full(NUM_SOURCES, WIDTH, np.int32),
+        height=np.full(NUM_SOURCES, HEIGHT, np.int32),
         limit=np.tile(np.array([WIDTH - 1.01, HEIGHT - 1.01], np.float32), (NUM_SOURCES, 1)),
         planes=maps.reshape(-1, 3),
-        plane_first=np.arange(NUM_SOURCES).astype(np.uint64) * np.uint64(size),
-        plane_size=np.tile(np.array([WIDTH, HEIGHT], np.int32), (NUM_SOURCES, 1)),
-        to_map=to_source,
-        from_map=np.stack([warp(levels[0], level) for level in levels[1:]]),
+        warp_back=np.stack([warp(levels[0], level) for level in levels[1:]]),
     )
     reference = cost.Reference(
         padded_grey=np.pad(cameras[0].grey, cost.PADDING, mode="edge"),

@@ -114,7 +114,7 @@ def test_searches_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     sweep = LevelSearch.sweep
 
     def recorded(self: LevelSearch, start: Hypotheses, iterations: range, random_depth: bool) -> Hypotheses:
-        searches.append((start.cost.shape, iterations, random_depth, len(self.sources.plane_size)))
+        searches.append((start.cost.shape, iterations, random_depth, len(self.sources.planes)))
         return sweep(self, start, iterations, random_depth)
 
     monkeypatch.setattr(LevelSearch, "sweep", recorded)
@@ -127,7 +127,7 @@ def test_searches_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         (coarse, range(3), True, 0),
         (middle, range(2), False, 0),
         (fine, range(1), False, 0),
-        (fine, range(1, 3), False, 2),
+        (fine, range(1, 3), False, 2 * height * width),
     ]
     assert searches == [search for search in once for _ in job.views]
 

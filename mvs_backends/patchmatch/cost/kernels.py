@@ -59,28 +59,24 @@ class Reference(NamedTuple):
 
 
 class Sources(NamedTuple):
-    """The N source views, their images and, in geometric passes, their hypotheses, each in one flat array."""
+    """The N source views; images and, in geometric passes, hypotheses are one after the other in flat arrays."""
 
     warp: NDArray[np.float32]
     """(N, 12) A (row by row) and k: reference pixel and inverse depth to homogeneous source pixel."""
     texels: NDArray[np.uint32]
-    """(T,) all images; each element packs the 2 x 2 neighbourhood to the right and below."""
+    """(T,) all pixels; each element packs the 2 x 2 neighbourhood to the right and below."""
     first: NDArray[np.uint64]
-    """(N,) where each image begins in `texels`."""
+    """(N,) where each image begins."""
     width: NDArray[np.int32]
+    """(N,)"""
+    height: NDArray[np.int32]
     """(N,)"""
     limit: NDArray[np.float32]
     """(N, 2) largest x and y at which the neighbourhood is whole."""
     planes: NDArray[np.float32]
-    """(M, 3) all hypothesis maps of the pass before; (0, 3) in a photometric pass."""
-    plane_first: NDArray[np.uint64]
-    """(N,)"""
-    plane_size: NDArray[np.int32]
-    """(N, 2) width, height of each hypothesis map."""
-    to_map: NDArray[np.float32]
-    """(N, 12) like `warp`, into the source's hypothesis map."""
-    from_map: NDArray[np.float32]
-    """(N, 12) back: map pixel and inverse depth to homogeneous reference pixel."""
+    """(T, 3) all pixels' hypotheses; (0, 3) in a photometric pass."""
+    warp_back: NDArray[np.float32]
+    """(N, 12) source pixel and inverse depth to homogeneous reference pixel."""
 
 
 class Window(NamedTuple):
@@ -258,7 +254,7 @@ def view_cost(j, pixel_x, pixel_y, w, a, b, variance, sources, window, scratch):
 @njit(forceinline=True, **COMPILED)
 def geometric_error(j, x, y, w, sources, cap):
     """Forward-backward reprojection error in reference pixels, at most `cap` (ACMM)."""
-    t = sources.to_map[j]
+    t = sources.warp[j]
     fx, fy = np.float32(x), np.float32(y)
     z = t[6] * fx + t[7] * fy + t[8] + t[11] * w
     if z <= _TINY:
@@ -266,17 +262,17 @@ def geometric_error(j, x, y, w, sources, cap):
     z = _ONE / z
     mx = (t[0] * fx + t[1] * fy + t[2] + t[9] * w) * z
     my = (t[3] * fx + t[4] * fy + t[5] + t[10] * w) * z
-    width, height = sources.plane_size[j, 0], sources.plane_size[j, 1]
+    width, height = sources.width[j], sources.height[j]
     if mx < -_HALF or my < -_HALF or mx > np.float32(width) - _HALF or my > np.float32(height) - _HALF:
         return cap
     ix, iy = min(np.int32(mx + _HALF), width - 1), min(np.int32(my + _HALF), height - 1)
-    index = sources.plane_first[j] + np.uint64(iy * width + ix)
+    index = sources.first[j] + np.uint64(iy * width + ix)
     there = sources.planes[index, 0]
     if there <= _ZERO:
         return cap
     # The source's own plane, not the nearest pixel's depth: on a slanted road the two differ by more than the cap.
     there += sources.planes[index, 1] * (mx - np.float32(ix)) + sources.planes[index, 2] * (my - np.float32(iy))
-    r = sources.from_map[j]
+    r = sources.warp_back[j]
     z = r[6] * mx + r[7] * my + r[8] + r[11] * there
     if z <= _TINY:
         return cap
