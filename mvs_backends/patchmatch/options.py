@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mvs_backends.base import MvsOptions, Preset
 
@@ -34,7 +34,7 @@ class PatchMatchOptions:
     """Bilateral weight: spread over distance. ACMM: 5."""
     sigma_grey: float = 20.0
     """Bilateral weight: spread over grey values of 0 to 255. ACMM: 3 for COLMAP-like weights."""
-    max_cost: float = 0.65
+    max_cost: float = 0.8
     """Pixels of a larger final cost, reprojection error included, get no depth."""
     max_prior_cost: float = 0.15
     """Pixels of at most this cost, whose depth two source views confirm, support the planar prior. ACMP: 0.1."""
@@ -68,7 +68,7 @@ class PatchMatchOptions:
 PRESETS = {
     Preset.PREVIEW: PatchMatchOptions(num_source_views=4, max_cost_views=3, iterations=(5, 2), finest_level=1),
     Preset.NORMAL: PatchMatchOptions(),
-    Preset.HIGH: PatchMatchOptions(num_source_views=9, max_cost_views=6, iterations=(8, 5, 3), geometric_iterations=2),
+    Preset.HIGH: PatchMatchOptions(iterations=(8, 5, 2), geometric_iterations=2),
 }
 
 
@@ -77,5 +77,4 @@ def options_of_preset(options: MvsOptions) -> PatchMatchOptions:
     preset = PRESETS[options.preset]
     if options.num_source_views == 0:
         return preset
-    values = {field: getattr(preset, field) for field in preset.__dataclass_fields__}
-    return PatchMatchOptions(**{**values, "num_source_views": options.num_source_views})
+    return replace(preset, num_source_views=options.num_source_views)
