@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -121,7 +121,7 @@ class Passes:
     def _search(self, number: int, view: int) -> Arrays:
         """Hypotheses of a search, from random ones or from those of the search before."""
         this = self._searches[number]
-        search = self._level_search(view, number, maps_of=number - 1 if this.is_geometric else None)
+        search = self._level_search(view, number)
         camera = level_camera(self.job.views[view], this.level)
         if search is None:
             return _arrays(_nothing(camera))
@@ -135,20 +135,23 @@ class Passes:
                 start = upsampled(start, coarse_grey, search.reference)
             if self.options.planar_prior:
                 start = self._with_planes(search, start, view, camera, number - 1)
+        if this.is_geometric:
+            search = search.with_maps(self._maps_of_sources(view, number - 1))
         return _arrays(search.sweep(start, this.sweeps, random_depth=number == 0))
 
     def _find_credible(self, number: int, view: int) -> Arrays:
         """Pixels whose depth is to be relied upon."""
-        search = self._level_search(view, number, maps_of=number)
+        search = self._level_search(view, number)
         found = self._hypotheses(_searched(number), view)
-        credible = search.credible(found) if search else np.zeros(found.cost.shape, np.bool_)
-        return {"credible": credible}
+        if search is None:
+            return {"credible": np.zeros(found.cost.shape, np.bool_)}
+        return {"credible": search.with_maps(self._maps_of_sources(view, number)).credible(found)}
 
     def _finish(self, view: int) -> Arrays:
         """The last hypotheses with planes, smoothed, those of high cost removed."""
         last = len(self._searches) - 1
         found = self._hypotheses(_searched(last), view)
-        search = self._level_search(view, last, maps_of=None)
+        search = self._level_search(view, last)
         if search is None:
             return _arrays(found)
         if self.options.planar_prior:
@@ -208,21 +211,24 @@ class Passes:
         here = cv2.resize(credible, size, interpolation=cv2.INTER_NEAREST).astype(np.bool_)
         return search.with_planes(found, here, np.concatenate(points))
 
-    def _level_search(self, view: int, number: int, maps_of: int | None) -> LevelSearch | None:
-        """A search of a view with the maps that a search left; None if there is nothing to search."""
+    def _level_search(self, view: int, number: int) -> LevelSearch | None:
+        """A search of a view; None if there is nothing to search."""
         level = self._level(number)
         reference, sources = self._reference(view, level), self._sources(view)
         if not sources or not (reference.inverse_range[..., 1] > 0).any():
             return None
-        maps = None if maps_of is None else partial(self._kept, _searched(maps_of), field="plane")
         return LevelSearch(
             reference=reference,
-            sources=gather_sources(self.job, view, sources, level, self.images, maps),
+            sources=gather_sources(self.job, view, sources, level, self.images),
             window=window(self.options),
             options=self.options,
             seed=self.seed + 1000003 * view + 7919 * number,
             executor=self.executor,
         )
+
+    def _maps_of_sources(self, view: int, number: int) -> Iterator[NDArray[np.float32]]:
+        """What a search left for the source views of a view."""
+        return (self._kept(_searched(number), source, "plane") for source in self._sources(view))
 
     def _sources(self, view: int) -> list[int]:
         # By index: nothing depends on the order in which a job names them.

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,15 +96,8 @@ def inverse_range(
     return result
 
 
-def gather_sources(
-    job: MvsJob,
-    view: int,
-    sources: Sequence[int],
-    level: int,
-    images: ImageCache,
-    maps: Callable[[int], NDArray[np.float32]] | None,
-) -> Sources:
-    """Images, cameras and, with `maps`, the hypotheses of the source views as flat arrays for the kernels.
+def gather_sources(job: MvsJob, view: int, sources: Sequence[int], level: int, images: ImageCache) -> Sources:
+    """Images and cameras of the source views as flat arrays for the kernels, without hypotheses.
 
     Args:
         job: the cluster.
@@ -112,25 +105,18 @@ def gather_sources(
         sources: its source views.
         level: how often all images are halved.
         images: where images come from.
-        maps: gives a view's hypotheses at that level.
     """
     reference = level_camera(job.views[view], level)
     cameras = [level_camera(job.views[s], level) for s in sources]
     packed = [images.get(s, level)[1] for s in sources]
-    first = np.cumsum([0, *(p.size for p in packed)])
-    planes = np.empty((first[-1] if maps else 0, 3), np.float32)
-    if maps:
-        # One after the other: two copies of all would not fit beside large images.
-        for s, begin, end in zip(sources, first, first[1:], strict=False):
-            planes[begin:end] = maps(s).reshape(-1, 3)
     return Sources(
         warp=np.stack([warp(c, reference) for c in cameras]),
         texels=np.concatenate(packed),
-        first=first[:-1].astype(np.uint64),
+        first=np.cumsum([0, *(p.size for p in packed[:-1])]).astype(np.uint64),
         width=np.array([c.width for c in cameras], np.int32),
         height=np.array([c.height for c in cameras], np.int32),
         limit=np.array([(c.width - 1.01, c.height - 1.01) for c in cameras], np.float32),
-        planes=planes,
+        planes=np.zeros((0, 3), np.float32),
         warp_back=np.stack([warp(reference, c) for c in cameras]),
     )
 
@@ -145,6 +131,14 @@ class LevelSearch:
     options: PatchMatchOptions
     seed: int
     executor: Executor
+
+    def with_maps(self, maps: Iterable[NDArray[np.float32]]) -> LevelSearch:
+        """The same search with the hypotheses of its source views, (H, W, 3) each, in their order."""
+        planes = np.empty((len(self.sources.texels), 3), np.float32)
+        # One after the other: two copies of all would not fit beside large images.
+        for first, plane in zip(self.sources.first.astype(np.int64), maps, strict=True):
+            planes[first : first + plane.shape[0] * plane.shape[1]] = plane.reshape(-1, 3)
+        return replace(self, sources=self.sources._replace(planes=planes))
 
     def _over_bands(self, kernel: Callable[..., None], mode: int, state: State, search: Search) -> None:
         """Run a kernel over the image, bands of rows in parallel."""
