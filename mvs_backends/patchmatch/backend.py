@@ -25,7 +25,7 @@ from mvs_backends.patchmatch.tiny_job import tiny_job
 
 logger = logging.getLogger(__name__)
 # Of the program; of a view that is worked on, beside the images kept.
-_PROGRAM_GIB, _BYTES_PER_PX = 0.25, 200
+_PROGRAM_GIB, _BYTES_PER_PX = 0.25, 250
 
 
 class PatchMatch(MvsBackend):

@@ -213,9 +213,11 @@ class Passes:
 
     def _level_search(self, view: int, number: int) -> LevelSearch | None:
         """A search of a view; None if there is nothing to search."""
-        level = self._level(number)
-        reference, sources = self._reference(view, level), self._sources(view)
-        if not sources or not (reference.inverse_range[..., 1] > 0).any():
+        level, sources = self._level(number), self._sources(view)
+        if not sources:
+            return None
+        reference = self._reference(view, level)
+        if not (reference.inverse_range[..., 1] > 0).any():
             return None
         return LevelSearch(
             reference=reference,

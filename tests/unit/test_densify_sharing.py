@@ -80,7 +80,7 @@ def test_clusters_share_the_gpus(
     ("free_gib", "num_jobs", "limit_px", "expected"),
     [
         (100.0, 0, 1600, 8),
-        (2.0, 0, 1600, 5),
+        (2.0, 0, 1600, 4),
         (2.0, 0, 0, 2),
         (0.1, 0, 1600, 1),
         (2.0, 7, 1600, 7),
