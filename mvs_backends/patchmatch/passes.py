@@ -34,7 +34,7 @@ from mvs_backends.patchmatch.search import (
 )
 
 Arrays = dict[str, NDArray[Any]]
-_FINISHED = "finished"
+_PLANED, _FINISHED = "planed", "finished"
 # What hides the region from a pixel is found as well, as there would else be a depth within the region all the same.
 _SHARE_BEFORE_REGION = 0.6
 
@@ -78,17 +78,21 @@ class Passes:
         """What there is to do, one after the other.
 
         Coarse to fine, each level is searched, the finest once more with the maps of all views in the cost; after each
-        search (for the planar prior) its credible pixels are found, which needs the maps of all views as well. The last
-        maps get planes and are smoothed, and at last averaged and written.
+        search (for the planar prior) its credible pixels are found, which needs the maps of all views as well. The maps
+        that the last search begins with have planes; those that it leaves get planes and are smoothed, and at last
+        averaged and written.
         """
-        costs = [len(search.sweeps) / 4.0**search.level for search in self._searches]
+        prior = self.options.planar_prior
         passes = []
-        for number, cost in enumerate(costs):
+        for number, search in enumerate(self._searches):
+            cost = len(search.sweeps) / 4.0**search.level
+            if prior and search.is_geometric:
+                passes.append(self._kept_pass(_PLANED, cost / 20, self._give_planes))
             passes.append(self._kept_pass(_searched(number), cost, partial(self._search, number)))
-            if self.options.planar_prior:
+            if prior:
                 passes.append(self._kept_pass(_credible(number), cost / 10, partial(self._find_credible, number)))
-        passes.append(self._kept_pass(_FINISHED, costs[-1] / 10, self._finish))
-        passes.append(Pass(share=costs[-1] / 10, is_done=partial(has_maps, self.job), run=self._write))
+        passes.append(self._kept_pass(_FINISHED, cost / 10, self._finish))
+        passes.append(Pass(share=cost / 10, is_done=partial(has_maps, self.job), run=self._write))
         total = sum(part.share for part in passes)
         return [replace(part, share=part.share / total) for part in passes]
 
@@ -128,16 +132,25 @@ class Passes:
         if number == 0:
             points, inverse_depths = sparse_points_in_image(self.job, view, camera)
             start = search.start(interpolated_planes(points, inverse_depths, camera.width, camera.height))
+        elif this.is_geometric:
+            before = _PLANED if self.options.planar_prior else _searched(number - 1)
+            start = self._hypotheses(before, view)
+            search = search.with_maps(self._maps_of_sources(before, view))
         else:
-            start = self._hypotheses(_searched(number - 1), view)
-            if not this.is_geometric:
-                coarse_grey, _ = self.images.get(view, self._level(number - 1))
-                start = upsampled(start, coarse_grey, search.reference)
+            coarse_grey, _ = self.images.get(view, self._level(number - 1))
+            start = upsampled(self._hypotheses(_searched(number - 1), view), coarse_grey, search.reference)
             if self.options.planar_prior:
                 start = self._with_planes(search, start, view, camera, number - 1)
-        if this.is_geometric:
-            search = search.with_maps(self._maps_of_sources(view, number - 1))
         return _arrays(search.sweep(start, this.sweeps, random_depth=number == 0))
+
+    def _give_planes(self, view: int) -> Arrays:
+        """Hypotheses of the last photometric search with planes."""
+        number = len(self.options.iterations) - 1
+        search, found = self._level_search(view, number), self._hypotheses(_searched(number), view)
+        if search is None:
+            return _arrays(found)
+        camera = level_camera(self.job.views[view], self._level(number))
+        return _arrays(self._with_planes(search, found, view, camera, number))
 
     def _find_credible(self, number: int, view: int) -> Arrays:
         """Pixels whose depth is to be relied upon."""
@@ -145,7 +158,7 @@ class Passes:
         found = self._hypotheses(_searched(number), view)
         if search is None:
             return {"credible": np.zeros(found.cost.shape, np.bool_)}
-        return {"credible": search.with_maps(self._maps_of_sources(view, number)).credible(found)}
+        return {"credible": search.with_maps(self._maps_of_sources(_searched(number), view)).credible(found)}
 
     def _finish(self, view: int) -> Arrays:
         """The last hypotheses with planes, smoothed, those of high cost removed."""
@@ -228,9 +241,9 @@ class Passes:
             executor=self.executor,
         )
 
-    def _maps_of_sources(self, view: int, number: int) -> Iterator[NDArray[np.float32]]:
-        """What a search left for the source views of a view."""
-        return (self._kept(_searched(number), source, "plane") for source in self._sources(view))
+    def _maps_of_sources(self, name: str, view: int) -> Iterator[NDArray[np.float32]]:
+        """What a pass left for the source views of a view."""
+        return (self._kept(name, source, "plane") for source in self._sources(view))
 
     def _sources(self, view: int) -> list[int]:
         # By index: nothing depends on the order in which a job names them.
