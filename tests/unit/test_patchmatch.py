@@ -132,6 +132,29 @@ def test_searches_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert searches == [search for search in once for _ in job.views]
 
 
+def test_the_last_search_sees_planes_in_the_other_views_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a bare wall they hold anything else, which no plane would agree with."""
+    maps_of_sources = []
+    sweep = LevelSearch.sweep
+
+    def recorded(self: LevelSearch, start: Hypotheses, iterations: range, random_depth: bool) -> Hypotheses:
+        if len(self.sources.planes):
+            maps_of_sources.append(self.sources.planes[:, 0])
+        return sweep(self, start, iterations, random_depth)
+
+    monkeypatch.setattr(LevelSearch, "sweep", recorded)
+    job = plane_job(tmp_path, normal=SLANTED, bare=(1.2, 0.8))
+    estimate_maps(job=job, options=PatchMatchOptions(), seed=0, num_threads=1)
+    view = job.views[0]
+    seen_by_last = maps_of_sources[-1][: view.height * view.width].reshape(view.height, view.width)
+    grey = cv2.imread(str(job.image_path(0)), cv2.IMREAD_GRAYSCALE)
+    bare = cv2.erode((grey == 128).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    off = np.abs(
+        1 / seen_by_last[bare] / true_depth(view, np.asarray(SLANTED) / np.linalg.norm(SLANTED), 5.0)[bare] - 1
+    )
+    assert np.mean(off < 0.01) > 0.9
+
+
 def test_seed_changes_the_search_and_not_the_surface(tmp_path: Path) -> None:
     one, two = (plane_job(tmp_path / name, normal=SLANTED) for name in ("one", "two"))
     first, second = run(one), run(two, options=MvsOptions(seed=5))
