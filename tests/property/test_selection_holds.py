@@ -241,9 +241,9 @@ def test_a_selection_meets_every_constraint_that_is_not_relaxed(
         assert selected.sum() >= min(wanted, usable.sum())
         for number in range(n_vis):
             count = int((usable_counts == number).sum())
-            told = [text for text in found.relaxed if f"seen by {number} usable" in text]
+            told = [text for text in found.relaxed if f"seen by {number} instead" in text]
             assert bool(told) == bool(count)
-            assert not told or told[0].startswith(f"{count} points")
+            assert not told or told[0].startswith(f"{count} of the points ")
         assert found.size_gap == 0
 
 
