@@ -14,10 +14,10 @@ images of a cluster that see 20 common keypoints with at least two others of it.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 import tempfile
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -69,7 +69,7 @@ class _Row:
         if self.num_clusters is None:
             return f"| {self.num_images:,} | {self.method} | over {self.cpu_s:,.0f} | | | | |"
         return (
-            f"| {self.num_images:,} | {self.method} | {self.cpu_s:,.1f} | {self.num_clusters} "
+            f"| {self.num_images:,} | {self.method} | {self.cpu_s:,.1f} | {self.num_clusters:,} "
             f"| {self.views_per_cluster:.1f} | {self.coverage:.1%} | {self.matchability:.1%} |"
         )
 
@@ -86,46 +86,48 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--scaling", type=Path)
     arguments = parser.parse_args()
-    rows: list[_Row] = []
     with tempfile.TemporaryDirectory(dir=arguments.output.parent) as scratch:
         drives = [_write_drive(wanted, Path(scratch) / str(wanted)) for wanted in sorted(arguments.images)]
         towns = [_town(model_dir) for model_dir in (*drives, *arguments.models)]
-
-        def run(method: str) -> None:
-            for row in _run_method(method, towns, arguments.limit_s):
-                print(row, file=sys.stderr, flush=True)
-                rows.append(row)
-                arguments.output.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
-
         with ThreadPoolExecutor(arguments.jobs) as pool:
-            list(pool.map(run, arguments.methods))
+            found = pool.map(lambda method: _run_method(method, towns, arguments.limit_s), arguments.methods)
+            rows = sorted(itertools.chain(*found), key=lambda row: (row.num_images, METHODS.index(row.method)))
+    arguments.output.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
     print(describe_machine())
     print(f"{_DRIVE}; limit {arguments.limit_s} CPU-s; {arguments.jobs} methods side by side")
     print("| images | method | CPU-s | clusters | views per cluster | coverage | matchability |")
     print("|---|---|---|---|---|---|---|")
-    for row in sorted(rows, key=lambda row: (row.num_images, METHODS.index(row.method))):
+    for row in rows:
         print(row)
     _write_figure(arguments.figure, rows, arguments.scaling)
 
 
-def _run_method(method: str, towns: list[_Town], limit_s: int) -> Iterator[_Row]:
-    """On ever larger towns, until it takes more than the limit."""
+def _run_method(method: str, towns: list[_Town], limit_s: int) -> list[_Row]:
+    """On ever larger towns, until it takes more than the limit; each row is shown as it comes."""
+    rows: list[_Row] = []
     for town in towns:
-        run = run_method(method, town.model_dir, limit_s)
-        if run is None:
-            yield _Row(num_images=town.num_images, method=method, cpu_s=limit_s)
-            return
-        cpu_s, clusters = run
-        coverage, matchability = _quality(town.seen, clusters)
-        yield _Row(
-            num_images=town.num_images,
-            method=method,
-            cpu_s=cpu_s,
-            num_clusters=len(clusters),
-            views_per_cluster=float(np.mean([len(images) for images in clusters])),
-            coverage=coverage,
-            matchability=matchability,
-        )
+        rows.append(_row(method, town, limit_s))
+        print(rows[-1], file=sys.stderr, flush=True)
+        if rows[-1].num_clusters is None:
+            break
+    return rows
+
+
+def _row(method: str, town: _Town, limit_s: int) -> _Row:
+    run = run_method(method, town.model_dir, limit_s)
+    if run is None:
+        return _Row(num_images=town.num_images, method=method, cpu_s=limit_s)
+    cpu_s, clusters = run
+    coverage, matchability = _quality(town.seen, clusters)
+    return _Row(
+        num_images=town.num_images,
+        method=method,
+        cpu_s=cpu_s,
+        num_clusters=len(clusters),
+        views_per_cluster=float(np.mean([len(images) for images in clusters])),
+        coverage=coverage,
+        matchability=matchability,
+    )
 
 
 def _write_figure(path: Path, rows: list[_Row], scaling: Path | None) -> None:

@@ -49,7 +49,7 @@ def run_method(method: str, model_dir: Path, limit_s: int) -> tuple[float, Clust
         output = Path(scratch) / "clusters.json"
         command = [sys.executable, "-m", __name__, method, str(model_dir), str(output), str(limit_s)]
         process = subprocess.run(command, check=False)
-        if process.returncode == -signal.SIGKILL:
+        if process.returncode == -signal.SIGXCPU:
             return None
         process.check_returncode()
         record = json.loads(output.read_text())
@@ -62,7 +62,8 @@ def _main(method: str, model_dir: str, output: str, limit_s: str) -> None:
         scene = open_scene(Path(scratch))
         started = time.process_time()
         limit = int(started) + int(limit_s)
-        resource.setrlimit(resource.RLIMIT_CPU, (limit, limit))
+        # Ended by SIGXCPU at the first, which no lack of memory sends.
+        resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 10))
         clusters = _METHODS[method](scene)
         spent_s = time.process_time() - started
     Path(output).write_text(json.dumps({"cpu_s": spent_s, "clusters": [images.tolist() for images in clusters]}))

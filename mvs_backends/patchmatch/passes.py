@@ -140,7 +140,7 @@ class Passes:
             coarse_grey, _ = self.images.get(view, self._level(number - 1))
             start = upsampled(self._hypotheses(_searched(number - 1), view), coarse_grey, search.reference)
             if self.options.planar_prior:
-                start = self._with_planes(search, start, view, camera, number - 1)
+                start = self._with_planes(search, start, view, this.level, number - 1)
         return _arrays(search.sweep(start, this.sweeps, random_depth=number == 0))
 
     def _give_planes(self, view: int) -> Arrays:
@@ -149,8 +149,7 @@ class Passes:
         search, found = self._level_search(view, number), self._hypotheses(_searched(number), view)
         if search is None:
             return _arrays(found)
-        camera = level_camera(self.job.views[view], self._level(number))
-        return _arrays(self._with_planes(search, found, view, camera, number))
+        return _arrays(self._with_planes(search, found, view, self.options.finest_level, number))
 
     def _find_credible(self, number: int, view: int) -> Arrays:
         """Pixels whose depth is to be relied upon."""
@@ -168,8 +167,7 @@ class Passes:
         if search is None:
             return _arrays(found)
         if self.options.planar_prior:
-            camera = level_camera(self.job.views[view], self._level(last))
-            found = self._with_planes(search, found, view, camera, last)
+            found = self._with_planes(search, found, view, self.options.finest_level, last)
         if self.options.smoothing_radius_px > 0:
             found = search.smoothed(found, self.options.smoothing_radius_px)
         found.plane[~(found.cost <= self.options.max_cost)] = 0.0
@@ -198,18 +196,17 @@ class Passes:
         depth, normal = depth_and_normal(plane, camera.calibration)
         write_maps(self.job, view, depth, normal)
 
-    def _with_planes(
-        self, search: LevelSearch, found: Hypotheses, view: int, camera: LevelCamera, number: int
-    ) -> Hypotheses:
+    def _with_planes(self, search: LevelSearch, found: Hypotheses, view: int, level: int, number: int) -> Hypotheses:
         """Hypotheses with planes through the credible points that a level's search found in the view and in others.
 
         Args:
-            search: at the level of
+            search: of the view.
             found: what to change.
-            view: the reference view and
-            camera: its camera at that level.
+            view: the reference view.
+            level: of both.
             number: of the search that the credible points are from.
         """
+        camera = level_camera(self.job.views[view], level)
         points = [
             points_in_image(
                 self._kept(_searched(number), other, "plane"),
