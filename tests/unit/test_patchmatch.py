@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -17,9 +19,10 @@ from fusion.cloud import read_ply
 from mvs_backends import backend_names, get_backend
 from mvs_backends.base import MvsError, MvsJob, MvsOptions, Preset
 from mvs_backends.patchmatch.backend import estimate_maps
+from mvs_backends.patchmatch.cost.kernels import Reference
 from mvs_backends.patchmatch.images import ImageCache, kept_bytes
-from mvs_backends.patchmatch.options import PatchMatchOptions
-from mvs_backends.patchmatch.search import Hypotheses, LevelSearch
+from mvs_backends.patchmatch.options import PRESETS, PatchMatchOptions, options_of_preset
+from mvs_backends.patchmatch.search import Hypotheses, LevelSearch, gather_sources, window
 from tests.reference.colmap_maps import read_map
 from tests.reference.plane_scene import plane_job, true_depth
 
@@ -153,6 +156,28 @@ def test_the_last_search_sees_planes_in_the_other_views_maps(tmp_path: Path, mon
         1 / seen_by_last[bare] / true_depth(view, np.asarray(SLANTED) / np.linalg.norm(SLANTED), 5.0)[bare] - 1
     )
     assert np.mean(off < 0.01) > 0.9
+
+
+def test_each_source_view_has_its_pixels_and_its_map_in_the_same_place(tmp_path: Path) -> None:
+    job = plane_job(tmp_path, normal=SLANTED, num_views=3)
+    small = dataclasses.replace(job.views[2], width=job.views[2].width - 10, height=job.views[2].height - 6)
+    job = dataclasses.replace(job, views=(*job.views[:2], small))
+    cv2.imwrite(str(job.image_path(2)), cv2.imread(str(job.image_path(2)))[: small.height, : small.width])
+    images = ImageCache(job)
+    sources = gather_sources(job, 0, [1, 2], 1, images)
+    sizes = [(view.width // 2, view.height // 2) for view in job.views[1:]]
+    assert list(zip(sources.width, sources.height, strict=True)) == sizes
+    maps = [np.full((height, width, 3), number, np.float32) for number, (width, height) in enumerate(sizes)]
+    with ThreadPoolExecutor(1) as executor:
+        options = PatchMatchOptions()
+        reference = Reference(np.zeros((0, 0), np.uint8), np.zeros((0, 0, 2), np.float32), np.ones(4, np.float32))
+        search = LevelSearch(
+            reference=reference, sources=sources, window=window(options), options=options, seed=0, executor=executor
+        ).with_maps(maps)
+    begins = [*sources.first.astype(int), len(sources.texels)]
+    for number, (begin, end) in enumerate(itertools.pairwise(begins)):
+        np.testing.assert_array_equal(sources.texels[begin:end], images.get(number + 1, 1)[1])
+        assert (search.sources.planes[begin:end] == number).all()
 
 
 def test_seed_changes_the_search_and_not_the_surface(tmp_path: Path) -> None:
@@ -293,6 +318,18 @@ def test_every_preset_fills_whole_size_maps(tmp_path: Path, preset: Preset) -> N
         assert depth.shape == (80, 112)
         assert normal.shape == (80, 112, 3)
         assert (depth > 0).mean() > 0.7
+
+
+@pytest.mark.parametrize("field", ["geometric_iterations", "geometric_weight", "smoothing_radius_px"])
+def test_negative_options_are_refused(field: str) -> None:
+    with pytest.raises(ValueError, match=f"{field} must be at least 0, not -1"):
+        dataclasses.replace(PatchMatchOptions(), **{field: -1})
+
+
+def test_a_number_of_source_views_replaces_that_of_the_preset_only() -> None:
+    asked = options_of_preset(MvsOptions(preset=Preset.HIGH, num_source_views=3))
+    assert asked == dataclasses.replace(PRESETS[Preset.HIGH], num_source_views=3)
+    assert options_of_preset(MvsOptions(preset=Preset.HIGH)) == PRESETS[Preset.HIGH]
 
 
 @pytest.mark.parametrize("field", ["num_source_views", "max_cost", "sigma_grey", "iterations"])
