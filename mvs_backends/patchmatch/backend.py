@@ -113,7 +113,7 @@ def _prepare_folder(job: MvsJob, options: PatchMatchOptions, seed: int) -> Path:
     digest = hashlib.sha256(job.boxes_in_world.tobytes() + job.points_in_world.tobytes())
     for view in job.views:
         digest.update(view.name.encode() + view.calibration.tobytes() + view.cam_from_world.tobytes())
-    made_by = json.dumps([7, asdict(options), seed, job.sources, digest.hexdigest()], sort_keys=True)
+    made_by = json.dumps([8, asdict(options), seed, job.sources, digest.hexdigest()], sort_keys=True)
     folder = _kept_folder(job)
     label = folder / "made_by.json"
     if folder.exists() and not (label.exists() and label.read_text() == made_by):

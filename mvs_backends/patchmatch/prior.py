@@ -3,28 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mvs_backends.patchmatch.geometry import LevelCamera, warp
+from mvs_backends.patchmatch.planes.kernels import (
+    FIT_SIZE,
+    MAX_ERROR_PX,
+    MAX_PLANES,
+    MIN_POINTS,
+    find_planes,
+    paint_planes,
+)
 
 # Grey values per pixel, of 255.
 _MAX_GRADIENT = 3.0
 _MIN_REGION_PX = 80
-_MIN_POINTS = 30
-_MAX_SCORED_POINTS = 2000
 _MAX_POINTS_OF_VIEW = 500_000
-_NUM_TRIALS, _NUM_REFINEMENTS = 60, 3
-_MIN_DETERMINANT = 1e-3
-_MAX_PLANES = 3
-# Of a region's credible points.
-_MIN_SHARE_FIRST, _MIN_SHARE_OTHER = 0.4, 0.15
-# A point lies on a plane, and a plane is known at a pixel, to the smaller of the two.
-_MAX_ERROR_PX, _MAX_RELATIVE_ERROR = 3.0, 0.025
-# So many pixels' errors are alike, as their windows overlap.
-_CORRELATED_PX = 25
+# Two pixels are much where parallax is little: far away almost anything would lie on one plane.
+_MAX_RELATIVE_ERROR = 0.025
 
 
 def interpolated_planes(
@@ -131,6 +131,7 @@ def region_planes(
     boxes: Sequence[tuple[slice, slice]],
     points: NDArray[np.float32],
     rate: NDArray[np.float32],
+    executor: Executor,
 ) -> NDArray[np.float32]:
     """Planes of evenly coloured regions, from the credible points of this view and others.
 
@@ -144,6 +145,7 @@ def region_planes(
         boxes: as `even_regions` returns them.
         points: (P, 3) columns, rows and inverse depths of points in the image, within half a pixel of its borders.
         rate: (P,) pixels in a source view per unit of inverse depth.
+        executor: runs regions side by side.
 
     Returns:
         (H, W, 3) inverse depth and its slopes along x and y; 0 where no plane is known.
@@ -153,77 +155,32 @@ def region_planes(
     region_of_point = regions[rows, columns]
     order = np.argsort(region_of_point, kind="stable")
     starts = np.searchsorted(region_of_point[order], np.arange(len(boxes) + 1))
-    generator = np.random.default_rng(0)
-    for region in np.flatnonzero(np.diff(starts) >= _MIN_POINTS).tolist():
-        box = boxes[region]
-        own = order[starts[region] : starts[region + 1]]
-        inside = points[own].astype(np.float64) - [box[1].start, box[0].start, 0]
-        _fit_region(regions[box] == region, inside, rate[own], planes[box], generator)
+
+    def fit(region: int) -> None:
+        box, own = boxes[region], order[starts[region] : starts[region + 1]]
+        x, y, w = (points[own] - np.array([box[1].start, box[0].start, 0])).T
+        px_per_w = np.maximum(rate[own], MAX_ERROR_PX / (_MAX_RELATIVE_ERROR * w))
+        _fit_region(regions[box], region, np.stack([x, y, w, px_per_w], axis=1), planes[box])
+
+    for _ in executor.map(fit, np.flatnonzero(np.diff(starts) >= MIN_POINTS).tolist()):
+        pass
     return planes
 
 
 def _fit_region(
-    member: NDArray[np.bool_],
-    points_in_box: NDArray[np.float64],
-    rate: NDArray[np.float32],
-    planes: NDArray[np.float32],
-    generator: np.random.Generator,
+    regions: NDArray[np.int32], region: int, points: NDArray[np.float64], planes: NDArray[np.float32]
 ) -> None:
     """Write the planes of one region; where it has several, each pixel's is that of the nearest point."""
-    columns, rows = _cells(points_in_box).T
-    points = np.stack([np.ones(len(rows)), points_in_box[:, 0] / 100, points_in_box[:, 1] / 100], axis=1)
-    w = points_in_box[:, 2]
-    # Two pixels are much where parallax is little: far away almost anything would lie on one plane.
-    rate = np.maximum(rate, _MAX_ERROR_PX / (_MAX_RELATIVE_ERROR * w))
-    remaining = np.arange(len(points))
-    found: list[NDArray[np.int64]] = []
-    while len(found) < _MAX_PLANES and len(remaining) >= _MIN_POINTS:
-        share = _MIN_SHARE_OTHER if found else _MIN_SHARE_FIRST
-        inliers = _largest_plane(points[remaining], w[remaining], rate[remaining], generator)
-        if len(inliers) < max(_MIN_POINTS, share * len(points)):
-            break
-        found.append(remaining[inliers])
-        remaining = np.delete(remaining, inliers)
-    nearest = np.zeros(member.shape, np.int64)
-    if len(found) > 1:
-        away = np.ones((len(found), *member.shape), np.uint8)
-        for number, chosen in enumerate(found):
-            away[number, rows[chosen], columns[chosen]] = 0
+    fits, owner = np.zeros((MAX_PLANES, FIT_SIZE)), np.empty(len(points), np.int8)
+    left, inliers = np.empty((2, len(points)), np.int64)
+    count = find_planes(points, region, left, inliers, fits, owner)
+    if count == 0:
+        return
+    nearest = np.zeros(regions.shape, np.int64)
+    if count > 1:
+        columns, rows = _cells(points).T
+        away = np.ones((count, *regions.shape), np.uint8)
+        on_plane = owner >= 0
+        away[owner[on_plane], rows[on_plane], columns[on_plane]] = 0
         nearest = np.argmin([cv2.distanceTransform(mask, cv2.DIST_L2, 3) for mask in away], axis=0)
-    for number, chosen in enumerate(found):
-        own = points[chosen]
-        plane = _least_squares(own, w[chosen])
-        spread = np.std((own @ plane - w[chosen]) * rate[chosen])
-        covariance = np.linalg.pinv(own.T @ own) * spread**2 * _CORRELATED_PX
-        y, x = np.nonzero(member & (nearest == number))
-        there = np.stack([np.ones(len(x)), x / 100, y / 100], axis=1)
-        known = np.sum(there @ covariance * there, axis=1) < _MAX_ERROR_PX**2
-        y, x = y[known], x[known]
-        planes[y, x, 0] = there[known] @ plane
-        planes[y, x, 1:] = plane[1:] / 100
-
-
-def _largest_plane(
-    points: NDArray[np.float64], w: NDArray[np.float64], rate: NDArray[np.float32], generator: np.random.Generator
-) -> NDArray[np.int64]:
-    """Indices of the points of the plane that most points lie on, by random sampling and refinement."""
-    drawn = generator.integers(len(points), size=(_NUM_TRIALS, 3))
-    corners = points[drawn]
-    solvable = np.abs(np.linalg.det(corners)) > _MIN_DETERMINANT
-    if not solvable.any():
-        return np.zeros(0, np.int64)
-    trials = np.asarray(np.linalg.solve(corners[solvable], w[drawn[solvable], None])[..., 0], np.float64)
-    scored = np.unique(np.linspace(0, len(points) - 1, _MAX_SCORED_POINTS).astype(np.int64))
-    errors = np.abs(trials @ points[scored].T - w[scored]) * rate[scored]
-    plane = trials[np.argmax((errors < _MAX_ERROR_PX).sum(axis=1))]
-    inliers = np.zeros(0, np.int64)
-    for _ in range(_NUM_REFINEMENTS):
-        inliers = np.flatnonzero(np.abs(points @ plane - w) * rate < _MAX_ERROR_PX)
-        if len(inliers) < _MIN_POINTS:
-            break
-        plane = _least_squares(points[inliers], w[inliers])
-    return inliers
-
-
-def _least_squares(points: NDArray[np.float64], w: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.linalg.lstsq(points.T @ points, points.T @ w, rcond=None)[0], np.float64)
+    paint_planes(regions, region, nearest, fits, planes)

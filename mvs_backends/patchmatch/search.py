@@ -231,7 +231,7 @@ class LevelSearch:
         """
         rate = np.empty(len(points), np.float32)
         parallax_rates(points, self.sources, rate)
-        planes = region_planes(*self._regions(), points, rate)
+        planes = region_planes(*self._regions(), points, rate, self.executor)
         low, high = np.moveaxis(self.reference.inverse_range, -1, 0)
         taken = (planes[..., 0] > 0) & (planes[..., 0] >= low) & (planes[..., 0] <= high) & ~credible
         return Hypotheses(
