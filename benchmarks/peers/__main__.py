@@ -23,7 +23,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import csr_array, vstack
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
 from app.clustering.options import ClusteringOptions
@@ -47,9 +48,9 @@ class _Town:
     """A model of a simulated drive."""
 
     model_dir: Path
-    num_images: int
-    seen: csr_array
-    """(N, P / 4) which image sees which keypoint from near enough."""
+    scene: PosedScene
+    tree: KDTree
+    """Every fourth keypoint's position on the ground."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +89,8 @@ def main() -> None:
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=arguments.output.parent) as scratch:
         drives = [_write_drive(wanted, Path(scratch) / str(wanted)) for wanted in sorted(arguments.images)]
-        towns = [_town(model_dir) for model_dir in (*drives, *arguments.models)]
+        models = (*drives, *arguments.models)
+        towns = [_town(model_dir, Path(scratch) / f"scene{number}") for number, model_dir in enumerate(models)]
         with ThreadPoolExecutor(arguments.jobs) as pool:
             found = pool.map(lambda method: _run_method(method, towns, arguments.limit_s), arguments.methods)
             rows = sorted(itertools.chain(*found), key=lambda row: (row.num_images, METHODS.index(row.method)))
@@ -116,11 +118,11 @@ def _run_method(method: str, towns: list[_Town], limit_s: int) -> list[_Row]:
 def _row(method: str, town: _Town, limit_s: int) -> _Row:
     run = run_method(method, town.model_dir, limit_s)
     if run is None:
-        return _Row(num_images=town.num_images, method=method, cpu_s=limit_s)
+        return _Row(num_images=len(town.scene.image_names), method=method, cpu_s=limit_s)
     cpu_s, clusters = run
-    coverage, matchability = _quality(town.seen, clusters)
+    coverage, matchability = _quality(town, clusters)
     return _Row(
-        num_images=town.num_images,
+        num_images=len(town.scene.image_names),
         method=method,
         cpu_s=cpu_s,
         num_clusters=len(clusters),
@@ -155,34 +157,34 @@ def _write_drive(wanted: int, folder: Path) -> Path:
     return folder
 
 
-def _town(model_dir: Path) -> _Town:
-    with tempfile.TemporaryDirectory() as scratch:
-        store_scene(model_dir, Path(scratch))
-        scene = open_scene(Path(scratch))
-        return _Town(model_dir=model_dir, num_images=len(scene.image_names), seen=_seen_keypoints(scene))
+def _town(model_dir: Path, folder: Path) -> _Town:
+    folder.mkdir()
+    store_scene(model_dir, folder)
+    scene = open_scene(folder)
+    return _Town(model_dir=model_dir, scene=scene, tree=KDTree(scene.points_in_world[::_EVERY_KEYPOINT, :2]))
 
 
-def _seen_keypoints(scene: PosedScene) -> csr_array:
-    """(N, P / 4) which image sees which keypoint from near enough."""
-    keypoints = scene.points_in_world[::_EVERY_KEYPOINT]
-    tree = KDTree(keypoints[:, :2])
-    rows = []
-    for image, center in enumerate(scene.centers_in_world):
-        near = np.array(tree.query_ball_point(center[:2], ClusteringOptions().max_camera_distance_m), dtype=np.int64)
-        visible = near[sees(scene, image, keypoints[near])]
-        ones = np.ones(len(visible), dtype=np.float32)
-        rows.append(csr_array((ones, visible, np.array([0, len(visible)])), shape=(1, len(keypoints))))
-    return vstack(rows, format="csr")
+def _seen_keypoints(town: _Town, images: NDArray[np.int64]) -> csr_array:
+    """(n, P / 4) which image sees which keypoint from near enough."""
+    keypoints = town.scene.points_in_world[::_EVERY_KEYPOINT]
+    seen = [np.empty(0, dtype=np.int64)]
+    for image, center in zip(images, town.scene.centers_in_world[images], strict=True):
+        near = np.array(town.tree.query_ball_point(center[:2], ClusteringOptions().max_camera_distance_m), np.int64)
+        seen.append(near[sees(town.scene, image, keypoints[near])])
+    starts = np.cumsum([len(visible) for visible in seen])
+    ones = np.ones(starts[-1], dtype=np.float32)
+    return csr_array((ones, np.concatenate(seen), starts), shape=(len(images), len(keypoints)))
 
 
-def _quality(seen: csr_array, clusters: Clusters) -> tuple[float, float]:
+def _quality(town: _Town, clusters: Clusters) -> tuple[float, float]:
     """Coverage and matchability, from 0 to 1."""
     options = SelectionOptions()
-    covered = np.zeros(seen.shape[1], dtype=np.bool_)
+    covered = np.zeros(town.tree.n, dtype=np.bool_)
     num_views = num_matched = 0
     for images in clusters:
-        visible = seen[images]
-        covered |= np.asarray(visible.sum(axis=0)).reshape(-1) >= options.n_vis
+        visible = _seen_keypoints(town, images)
+        keypoints, views = np.unique(visible.indices, return_counts=True)
+        covered[keypoints[views >= options.n_vis]] = True
         shared = (visible @ visible.T).toarray()
         np.fill_diagonal(shared, 0)
         partners = (shared >= options.min_shared_points / _EVERY_KEYPOINT).sum(axis=1)

@@ -10,9 +10,10 @@ from __future__ import annotations
 import numpy as np
 import pymetis
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
 
 from app.scene.posed_scene import PosedScene
-from benchmarks.peers.tracks import image_pairs, sum_by_pair
+from benchmarks.peers.tracks import count_pairs
 
 _LEAF_MAX_NUM_IMAGES = 500
 _IMAGE_OVERLAP = 50
@@ -20,24 +21,24 @@ _IMAGE_OVERLAP = 50
 
 def metis_clusters(scene: PosedScene) -> list[NDArray[np.int64]]:
     """Rows of the images of each leaf; two images match as often as they observe the same point."""
-    _, first, second = image_pairs(scene)
-    a, b, _, weights = sum_by_pair(first, second, np.ones(len(first)))
+    a, b, weights = count_pairs(scene)
     leaves = []
-    waiting = [(np.unique([a, b]), np.arange(len(a)), dict[int, int]())]
+    waiting = [(_distinct(a, b), np.arange(len(a), dtype=np.int32), dict[int, int]())]
     while waiting:
         images, edges, anchors = waiting.pop()
         if len(edges) == 0 or len(images) <= _LEAF_MAX_NUM_IMAGES + _IMAGE_OVERLAP:
             leaves.append(images)
             continue
-        label = _bisect(a[edges], b[edges], weights[edges], len(scene.image_names))
+        label = _bisect(images, a[edges], b[edges], weights[edges])
         for image, anchor in anchors.items():
             label[image] = label[anchor]
         label[label < 0] = 0
-        crossing = edges[label[a[edges]] != label[b[edges]]]
+        side_of_a, side_of_b = label[a[edges]], label[b[edges]]
+        crossing = edges[side_of_a != side_of_b]
         heaviest_first = crossing[np.argsort(-weights[crossing], kind="stable")]
         for side in (0, 1):
             own = images[label[images] == side]
-            inner = edges[(label[a[edges]] == side) & (label[b[edges]] == side)]
+            inner = edges[(side_of_a == side) & (side_of_b == side)]
             guests = _guests(a[heaviest_first], b[heaviest_first], label, side)
             child = np.unique(np.concatenate([own, np.array(list(guests), dtype=np.int64)]))
             if len(child) == len(images):
@@ -47,26 +48,34 @@ def metis_clusters(scene: PosedScene) -> list[NDArray[np.int64]]:
     return leaves
 
 
+def _distinct(a: NDArray[np.int32], b: NDArray[np.int32]) -> NDArray[np.int64]:
+    """The images of some edges, ascending."""
+    present = np.zeros(max(a.max(initial=-1), b.max(initial=-1)) + 1, dtype=np.bool_)
+    present[a] = present[b] = True
+    return np.flatnonzero(present)
+
+
 def _bisect(
-    a: NDArray[np.int64], b: NDArray[np.int64], weights: NDArray[np.int64], num_images: int
-) -> NDArray[np.int64]:
-    """(num_images,) side of each image, -1 where it has no edge."""
-    nodes, ends = np.unique(np.concatenate([a, b]), return_inverse=True)
-    others, both = np.roll(ends, len(a)), np.tile(weights, 2)
-    order = np.argsort(ends, kind="stable")
-    starts = np.searchsorted(ends[order], np.arange(len(nodes) + 1))
-    _, sides = pymetis.part_graph(2, xadj=starts, adjncy=others[order], eweights=both[order], recursive=False)
-    label = np.full(num_images, -1, dtype=np.int64)
+    images: NDArray[np.int64], a: NDArray[np.int32], b: NDArray[np.int32], weights: NDArray[np.int32]
+) -> NDArray[np.int8]:
+    """Side of each image, by its row; -1 where it has no edge."""
+    nodes = _distinct(a, b)
+    node = np.zeros(images[-1] + 1, dtype=np.int32)
+    node[nodes] = np.arange(len(nodes))
+    half = coo_array((weights, (node[a], node[b])), shape=(len(nodes), len(nodes))).tocsr()
+    graph = half + half.T
+    _, sides = pymetis.part_graph(2, xadj=graph.indptr, adjncy=graph.indices, eweights=graph.data, recursive=False)
+    label = np.full(len(node), -1, dtype=np.int8)
     label[nodes] = sides
     return label
 
 
-def _guests(a: NDArray[np.int64], b: NDArray[np.int64], label: NDArray[np.int64], side: int) -> dict[int, int]:
+def _guests(a: NDArray[np.int32], b: NDArray[np.int32], label: NDArray[np.int8], side: int) -> dict[int, int]:
     """Images of the other side on the heaviest edges, each with the image of this side that it goes with."""
     guests: dict[int, int] = {}
-    for first, second in zip(a.tolist(), b.tolist(), strict=True):
+    for first, second in zip(a, b, strict=True):
         own, other = (first, second) if label[first] == side else (second, first)
-        guests.setdefault(other, own)
+        guests.setdefault(int(other), int(own))
         if len(guests) >= _IMAGE_OVERLAP:
             break
     return guests

@@ -15,11 +15,10 @@ from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.linalg import eigsh
 
 from app.scene.posed_scene import PosedScene
+from benchmarks.peers.angles import angle_weights
 from benchmarks.peers.tracks import image_pairs, sum_by_pair
 
 _MAX_IMAGES = 150
-_BEST_ANGLE_DEG = 20.0
-_SPREAD_BELOW_DEG, _SPREAD_ABOVE_DEG = 5.0, 15.0
 _MIN_ACCURACY = 0.7
 """lambda: a keypoint is covered if a cluster triangulates it this well, relative to all its images."""
 _MIN_COVERAGE = 0.7
@@ -31,7 +30,7 @@ _MAX_ADDITIONS = 20
 def normalized_cut_clusters(scene: PosedScene) -> list[NDArray[np.int64]]:
     """Rows of the images of each cluster."""
     points, a, b = image_pairs(scene)
-    weights = _angle_weights(scene, points, a, b)
+    weights = angle_weights(scene.points_in_world, scene.centers_in_world, points, a, b)
     first, second, sums, counts = sum_by_pair(a, b, weights)
     num_images = len(scene.image_names)
     half = coo_array((sums / counts, (first, second)), shape=(num_images, num_images))
@@ -44,23 +43,6 @@ def normalized_cut_clusters(scene: PosedScene) -> list[NDArray[np.int64]]:
             break
         clusters = _cut_until_small(clusters, graph)
     return clusters
-
-
-def _angle_weights(
-    scene: PosedScene, points: NDArray[np.int64], a: NDArray[np.int64], b: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """(Q,) Gaussian of the angle at each point between two images."""
-    weights = np.empty(len(points))
-    centers = scene.centers_in_world
-    for start in range(0, len(points), 1 << 20):
-        piece = slice(start, start + (1 << 20))
-        position = scene.points_in_world[points[piece]]
-        to_a, to_b = centers[a[piece]] - position, centers[b[piece]] - position
-        norms = np.linalg.norm(to_a, axis=1) * np.linalg.norm(to_b, axis=1)
-        angles = np.degrees(np.arccos(np.clip(np.sum(to_a * to_b, axis=1) / norms, -1.0, 1.0)))
-        spread = np.where(angles < _BEST_ANGLE_DEG, _SPREAD_BELOW_DEG, _SPREAD_ABOVE_DEG)
-        weights[piece] = np.exp(-((angles - _BEST_ANGLE_DEG) ** 2) / (2 * spread**2))
-    return weights
 
 
 def _cut_until_small(clusters: list[NDArray[np.int64]], graph: csr_array) -> list[NDArray[np.int64]]:
