@@ -346,14 +346,18 @@ from numba.core.registry import CPUDispatcher
 import mvs_backends.patchmatch.cost.kernels as cost
 import mvs_backends.patchmatch.kernels as search
 import mvs_backends.patchmatch.maps.kernels as maps
+import mvs_backends.patchmatch.planes.kernels as planes
 from mvs_backends.patchmatch.tiny_job import tiny_job
 from tests.unit.test_patchmatch import MvsOptions, SLANTED, plane_job, run
 kernels = {{
-    kernel for module in (cost, search, maps) for kernel in vars(module).values() if isinstance(kernel, CPUDispatcher)
+    kernel
+    for module in (cost, search, maps, planes)
+    for kernel in vars(module).values()
+    if isinstance(kernel, CPUDispatcher)
 }}
 run(tiny_job(Path({str(tmp_path)!r}) / "tiny"))
 compiled = {{kernel: set(kernel.signatures) for kernel in kernels}}
-assert search.sweep_rows.signatures
+assert all(compiled[kernel] for kernel in kernels if kernel.stats.cache_path)
 for preset in ("preview", "normal"):
     job = plane_job(Path({str(tmp_path)!r}) / preset, normal=SLANTED, num_views=3)
     run(job, options=MvsOptions(preset=preset))

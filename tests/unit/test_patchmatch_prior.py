@@ -48,7 +48,8 @@ def planes_of(regions: NDArray, boxes: list, found: NDArray, credible: NDArray) 
     """The planes of regions from the credible of the found inverse depths."""
     y, x = np.nonzero(credible)
     points = np.stack([x, y, found[y, x]], axis=1).astype(np.float32)
-    return region_planes(regions, boxes, points, np.full(len(points), RATE, np.float32))
+    with ThreadPoolExecutor(2) as executor:
+        return region_planes(regions, boxes, points, np.full(len(points), RATE, np.float32), executor)
 
 
 def test_each_wall_gets_its_plane_in_spite_of_outliers() -> None:

@@ -11,7 +11,8 @@ from numba.core.registry import CPUDispatcher
 from mvs_backends.patchmatch import kernels as search
 from mvs_backends.patchmatch.cost import kernels as cost
 from mvs_backends.patchmatch.maps import kernels as maps_kernels
-from tests.reference import patchmatch
+from mvs_backends.patchmatch.planes import kernels as planes_kernels
+from tests.reference import patchmatch, region_planes
 from tests.reference import patchmatch_search as plain
 from tests.reference.stereo_scene import HEIGHT, NUM_SOURCES, SIGMAS, WIDTH, WINDOW, wall_scene
 
@@ -51,6 +52,12 @@ TWINS = {
     "_update_pixel": plain.updated_pixel,
     "sweep_rows": plain.swept,
     "initialise_rows": plain.initialised,
+    "_is_on": region_planes.errors_px,
+    "_draw": region_planes.drawn,
+    "_least_squares": region_planes.least_squares,
+    "_largest_plane": region_planes.largest_plane,
+    "find_planes": region_planes.owners,
+    "paint_planes": region_planes.painted,
 }
 
 
@@ -134,10 +141,10 @@ def test_start(seed: int, num_random: int, max_views: int) -> None:
 
 
 def test_every_kernel_has_a_twin() -> None:
-    """Each is compared in this file or in `test_patchmatch_kernels.py`, by itself or within what calls it."""
+    """Each is compared here, with other kernels in a file beside this one, or within what calls it."""
     compiled = {
         name
-        for module in (cost, search, maps_kernels)
+        for module in (cost, search, maps_kernels, planes_kernels)
         for name, kernel in vars(module).items()
         if isinstance(kernel, CPUDispatcher) and kernel.py_func.__module__ == module.__name__
     }

@@ -24,10 +24,10 @@ MIN_POINTS = 30
 """Fewer determine no plane."""
 MAX_ERROR_PX = 3.0
 """Of a point that lies on a plane, and of a plane at a pixel where it is known."""
-MAX_SCORED_POINTS = 2000
-"""Of more, evenly spread ones tell how good a trial is."""
-NUM_TRIALS, NUM_REFINEMENTS = 60, 3
 
+_NUM_TRIALS, _NUM_REFINEMENTS = 60, 3
+# Of more, evenly spread ones tell how good a trial is.
+_MAX_SCORED_POINTS = 2000
 # Of a region's points.
 _MIN_SHARE_FIRST, _MIN_SHARE_OTHER = 0.4, 0.15
 # Twice the area in pixels of the triangle of a trial.
@@ -102,9 +102,9 @@ def _least_squares(points, inliers, num_inliers, fit):
 def _largest_plane(points, left, num_left, seed, inliers, fit):
     """Find the plane that most of the points left lie on, by random sampling; how many do."""
     first = np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15)
-    step = 1 + (num_left - 1) // MAX_SCORED_POINTS
+    step = 1 + (num_left - 1) // _MAX_SCORED_POINTS
     best, most = first, -1
-    for number in range(NUM_TRIALS):
+    for number in range(_NUM_TRIALS):
         state = first + np.uint64(3 * number)
         if not _draw(points, left, num_left, state, fit):
             continue
@@ -115,7 +115,7 @@ def _largest_plane(points, left, num_left, seed, inliers, fit):
             best, most = state, count
     if not _draw(points, left, num_left, best, fit):
         return 0
-    for _ in range(NUM_REFINEMENTS):
+    for _ in range(_NUM_REFINEMENTS):
         num_inliers = 0
         for n in range(num_left):
             if _is_on(points, left[n], fit):
