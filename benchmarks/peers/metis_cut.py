@@ -64,7 +64,8 @@ def _bisect(
     node[nodes] = np.arange(len(nodes))
     half = coo_array((weights, (node[a], node[b])), shape=(len(nodes), len(nodes))).tocsr()
     graph = half + half.T
-    _, sides = pymetis.part_graph(2, xadj=graph.indptr, adjncy=graph.indices, eweights=graph.data, recursive=False)
+    adjacency = pymetis.CSRAdjacency(graph.indptr, graph.indices)
+    _, sides = pymetis.part_graph(2, adjacency, eweights=graph.data, recursive=False)
     label = np.full(len(node), -1, dtype=np.int8)
     label[nodes] = sides
     return label
