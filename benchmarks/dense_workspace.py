@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Container
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from mvs_backends.base import MvsJob
 def make_workspace(
     folder: Path, *, model: Path, images: Path, frames: Container[int], side_m: float = 0.0, max_image_size_px: int = 0
 ) -> MvsJob:
-    """Prepare ``folder/workspace``.
+    """Prepare ``folder/workspace``, anew if there is one.
 
     Args:
         folder: to work in.
@@ -55,4 +56,6 @@ def make_workspace(
         digests={},
     )
     options = DensifyOptions(max_image_size_px=max_image_size_px)
+    # What lies there may be of another size.
+    shutil.rmtree(folder / "workspace", ignore_errors=True)
     return prepare_workspace(job, folder / "workspace", image_root=images, mask_root=None, options=options)
