@@ -164,16 +164,17 @@ def _town(model_dir: Path, folder: Path) -> _Town:
     return _Town(model_dir=model_dir, scene=scene, tree=KDTree(scene.points_in_world[::_EVERY_KEYPOINT, :2]))
 
 
-def _seen_keypoints(town: _Town, images: NDArray[np.int64]) -> csr_array:
-    """(n, P / 4) which image sees which keypoint from near enough."""
+def _seen_keypoints(town: _Town, images: NDArray[np.int64]) -> tuple[csr_array, NDArray[np.int64]]:
+    """Which image sees which keypoint from near enough: (n, k), and (k,) numbers of these keypoints in the tree."""
     keypoints = town.scene.points_in_world[::_EVERY_KEYPOINT]
     seen = [np.empty(0, dtype=np.int64)]
     for image, center in zip(images, town.scene.centers_in_world[images], strict=True):
         near = np.array(town.tree.query_ball_point(center[:2], ClusteringOptions().max_camera_distance_m), np.int64)
         seen.append(near[sees(town.scene, image, keypoints[near])])
+    numbers, columns = np.unique(np.concatenate(seen), return_inverse=True)
     starts = np.cumsum([len(visible) for visible in seen])
-    ones = np.ones(starts[-1], dtype=np.float32)
-    return csr_array((ones, np.concatenate(seen), starts), shape=(len(images), len(keypoints)))
+    ones = np.ones(len(columns), dtype=np.float32)
+    return csr_array((ones, columns, starts), shape=(len(images), len(numbers))), numbers
 
 
 def _quality(town: _Town, clusters: Clusters) -> tuple[float, float]:
@@ -182,9 +183,8 @@ def _quality(town: _Town, clusters: Clusters) -> tuple[float, float]:
     covered = np.zeros(town.tree.n, dtype=np.bool_)
     num_views = num_matched = 0
     for images in clusters:
-        visible = _seen_keypoints(town, images)
-        keypoints, views = np.unique(visible.indices, return_counts=True)
-        covered[keypoints[views >= options.n_vis]] = True
+        visible, keypoints = _seen_keypoints(town, images)
+        covered[keypoints[np.asarray(visible.sum(axis=0)).reshape(-1) >= options.n_vis]] = True
         shared = (visible @ visible.T).toarray()
         np.fill_diagonal(shared, 0)
         partners = (shared >= options.min_shared_points / _EVERY_KEYPOINT).sum(axis=1)
