@@ -23,7 +23,7 @@ from mvs_backends.patchmatch.planes.kernels import (
 _MAX_GRADIENT = 3.0
 _MIN_REGION_PX = 80
 _MAX_POINTS_OF_VIEW = 500_000
-# Two pixels are much where parallax is little: far away almost anything would lie on one plane.
+# Of a point that lies on a plane: where parallax is little, almost anything lies on one to a few pixels.
 _MAX_RELATIVE_ERROR = 0.025
 
 
