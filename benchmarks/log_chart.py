@@ -9,6 +9,7 @@ from pathlib import Path
 
 _WIDTH, _HEIGHT = 720, 420
 _LEFT, _RIGHT, _TOP, _BOTTOM = 70, 170, 20, 50
+_LINE_HEIGHT = 16
 _COLORS = ("#0b5394", "#cc4125", "#6aa84f", "#8e7cc3", "#b45f06")
 
 
@@ -34,6 +35,7 @@ def write_log_chart(
         left, y = place(10.0 ** x_range[0], 10.0**power)
         parts.append(f'<line x1="{left:.1f}" y1="{y:.1f}" x2="{_WIDTH - _RIGHT}" y2="{y:.1f}" stroke="#ddd"/>')
         parts.append(f'<text x="{left - 8:.1f}" y="{y + 4:.1f}" text-anchor="end">{_number(power)}</text>')
+    ends = []
     for (name, line), color in zip(series.items(), _COLORS, strict=False):
         if not line:
             continue
@@ -41,8 +43,13 @@ def write_log_chart(
         corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
         parts.append(f'<polyline points="{corners}" fill="none" stroke="{color}" stroke-width="2"/>')
         parts.extend(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="{color}"/>' for x, y in places)
-        x, y = places[-1]
-        parts.append(f'<text x="{x + 8:.1f}" y="{y + 4:.1f}" fill="{color}">{escape(name)}</text>')
+        ends.append((*places[-1], name, color))
+    before = lowest = -math.inf
+    for x, y, name, color in sorted(ends):
+        # Names of lines that end together stand one below the other.
+        lowest = max(y + 4, lowest + _LINE_HEIGHT) if x - before < 1 else y + 4
+        before = x
+        parts.append(f'<text x="{x + 8:.1f}" y="{lowest:.1f}" fill="{color}">{escape(name)}</text>')
     middle_x, middle_y = (_LEFT + _WIDTH - _RIGHT) / 2, (_TOP + _HEIGHT - _BOTTOM) / 2
     parts.append(f'<text x="{middle_x}" y="{_HEIGHT - 10}" text-anchor="middle">{escape(x_title)}</text>')
     parts.append(
