@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import itertools
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
+from benchmarks.log_chart import write_log_chart
 from benchmarks.peers import clique_ilp, metis_cut, tracks
+from benchmarks.peers.__main__ import _quality, _Town
 from benchmarks.peers.angles import angle_weights
+from benchmarks.reference.clustering import sees
 from tests.reference.posed_scenes import level_camera, make_scene, random_scene
 
 
@@ -97,3 +103,44 @@ def test_leaves_of_the_cut_hold_all_images_and_share_some(monkeypatch: pytest.Mo
     assert all(len(leaf) <= 24 for leaf in leaves)
     assert 5 <= len(leaves) <= 10
     assert all(np.ptp(leaf) < 40 for leaf in leaves)
+
+
+def test_coverage_and_matchability_are_those_of_all_pairs() -> None:
+    scene = random_scene(8, num_images=30, num_points=800)
+    tree = KDTree(scene.points_in_world[::4, :2])
+    clusters = [np.arange(6), np.arange(4, 10), np.array([25])]
+    covered = np.zeros(200, dtype=bool)
+    num_matched = 0
+    for images in clusters:
+        seen = {
+            image: {
+                number
+                for number, point in enumerate(scene.points_in_world[::4])
+                if np.hypot(*(point - scene.centers_in_world[image])[:2]) <= 38
+                and sees(scene, image, point[None]).all()
+            }
+            for image in images
+        }
+        for number in range(200):
+            covered[number] |= sum(number in points for points in seen.values()) >= 2
+        for image in images:
+            partners = [other for other in images if other != image and len(seen[image] & seen[other]) >= 5]
+            num_matched += len(partners) >= 2
+    assert 20 < covered.sum() < 180
+    assert 2 < num_matched < 12
+    town = _Town(model_dir=Path(), scene=scene, tree=tree)
+    assert _quality(town, clusters) == pytest.approx((covered.mean(), num_matched / 13))
+
+
+def test_names_of_lines_that_end_together_do_not_overlap(tmp_path: Path) -> None:
+    ends = {"a": (1000.0, 50.0), "b": (1000.0, 51.0), "c": (1000.0, 49.0), "d": (10.0, 50.0)}
+    write_log_chart(
+        tmp_path / "chart.svg", {name: [(1.0, 1.0), end] for name, end in ends.items()}, x_title="x", y_title="y"
+    )
+    texts = re.findall(
+        r'<text x="([\d.]+)" y="([\d.]+)" fill="[^"]*">(\w)</text>', (tmp_path / "chart.svg").read_text()
+    )
+    height = {name: float(y) for _, y, name in texts}
+    assert height["b"] <= height["a"] - 15
+    assert height["a"] <= height["c"] - 15
+    assert height["d"] == pytest.approx(height["b"], abs=3)
