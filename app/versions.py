@@ -13,7 +13,7 @@ _VERSIONS = {
     "cluster": 1,
     "select": 4,
     "jobs": 1,
-    "densify": 5,
+    "densify": 6,
     "fuse": 1,
 }
 
