@@ -6,7 +6,7 @@ import importlib
 import os
 import platform
 import shutil
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, packages_distributions, version
 from pathlib import Path
 
 from app.executor import available_cores
@@ -24,6 +24,7 @@ _PACKAGES = (
     ("trimesh", "trimesh"),
     ("open3d", "open3d"),
 )
+"""What is asked for, and a module of it. Another package may bring the module, as pycolmap-cuda12 does."""
 
 
 def diagnose() -> str:
@@ -36,7 +37,9 @@ def diagnose() -> str:
         "",
         "packages",
     ]
-    for distribution, module in _PACKAGES:
+    installed = packages_distributions()
+    for wanted, module in _PACKAGES:
+        distribution = next(iter(installed.get(module.partition(".")[0], ())), wanted)
         problem = _import_problem(module)
         if problem is not None and module == "open3d":
             problem += " (only `compare` needs it)"

@@ -8,8 +8,8 @@ it in the same world, WORK a folder to work in, emptied first. All images are on
 `--views-agree`; for OpenMVS a further row scores the cloud that it fuses itself, neither masked nor cut to the region.
 
 Time is CPU-seconds, user and system, of the program and its children, with our kernels compiled before: of the maps,
-and of fusing them. Scores are accuracy / completeness / F in %, both sides thinned to 5 cm voxels, accuracy to the
-mesh. Without `gt.ply` only points are counted.
+per megapixel, and of fusing them. What a GPU does shows in the wall time of the maps only. Scores are accuracy /
+completeness / F in %, both sides thinned to 5 cm voxels, accuracy to the mesh. Without `gt.ply` only points count.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import logging
 import resource
 import shutil
 import sys
+import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -64,7 +65,6 @@ def main() -> None:
     parser.add_argument("--preset", type=Preset, default=Preset.NORMAL)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--views-agree", type=int, nargs="+", default=[2, 3], help="FusionOptions.min_num_pixels")
-    parser.add_argument("--keep-maps", action="store_true", help="of an earlier call, and only fuse and score them")
     for program in ("openmvs", "colmap", "acmp"):
         parser.add_argument(f"--{program}-path", default="")
     arguments = parser.parse_args()
@@ -78,13 +78,15 @@ def main() -> None:
     names = [name for name in arguments.backends.split(",") if name]
     names = names or [name for name in backend_names() if get_backend(name).availability(options).ok]
     print(describe_machine(), end="\n\n")
-    print("| back-end | CPU-s | per MP | fusion CPU-s | points | " + _cells(f"{100 * t:g} cm" for t in _THRESHOLDS_M))
-    print("|---" * (5 + len(_THRESHOLDS_M)) + "|")
+    print(
+        "| back-end | wall s | CPU-s | per MP | fusion CPU-s | points | "
+        + _cells(f"{100 * t:g} cm" for t in _THRESHOLDS_M)
+    )
+    print("|---" * (6 + len(_THRESHOLDS_M)) + "|")
     first, last = (int(part) for part in arguments.frames.split("-"))
     for name in names:
         work = arguments.work / name
-        if not arguments.keep_maps:
-            shutil.rmtree(work, ignore_errors=True)
+        shutil.rmtree(work, ignore_errors=True)
         job = make_workspace(
             work,
             model=arguments.model,
@@ -92,41 +94,44 @@ def main() -> None:
             frames=range(first, last + 1),
             max_image_size_px=arguments.max_image_size,
         )
-        if not arguments.keep_maps:
-            _estimate(name, job, options, work, arguments.threads)
-        _score(name, job, work, arguments.truth, arguments.views_agree)
+        times = _estimate(name, job, options, work, arguments.threads)
+        _score(name, job, work, arguments.truth, arguments.views_agree, times)
 
 
-def _estimate(name: str, job: MvsJob, options: MvsOptions, work: Path, num_threads: int) -> None:
-    """Leave the maps, and how long they took in `maps.json`."""
+def _estimate(name: str, job: MvsJob, options: MvsOptions, work: Path, num_threads: int) -> tuple[float, float]:
+    """Leave the maps; wall time and CPU-seconds that they took."""
     if name == "patchmatch":
         _compile(job)
     if name == "openmvs":
         options = dataclasses.replace(options, openmvs_path=str(_fusing_openmvs(work / "bin", options.openmvs_path)))
-    started = _cpu_seconds()
+    wall_started, started = time.perf_counter(), _cpu_seconds()
     get_backend(name).estimate(job=job, options=options, num_threads=num_threads)
-    maps_s = _cpu_seconds() - started
+    wall_s, cpu_s = time.perf_counter() - wall_started, _cpu_seconds() - started
     own = work / "bin" / "own.json"
-    (work / "maps.json").write_text(json.dumps(maps_s - (json.loads(own.read_text()) if own.exists() else 0.0)))
+    own_s = float(json.loads(own.read_text())) if own.exists() else 0.0
+    return wall_s - own_s, cpu_s - own_s
 
 
-def _score(name: str, job: MvsJob, work: Path, truth: Path, views_agree: Sequence[int]) -> None:
-    maps_s = float(json.loads((work / "maps.json").read_text()))
+def _score(
+    name: str, job: MvsJob, work: Path, truth: Path, views_agree: Sequence[int], times: tuple[float, float]
+) -> None:
+    wall_s, cpu_s = times
     megapixels = sum(view.width * view.height for view in job.views) / 1e6
+    maps = f"{wall_s:,.0f}", f"{cpu_s:,.0f}", f"{cpu_s / megapixels:.1f}"
     for count in views_agree:
         started = _cpu_seconds()
         fusion = FusionOptions(min_num_pixels=count)
         cloud = fuse_depth_maps(job.workspace, work / "scratch.ply", options=fusion, bounds=_EVERYWHERE)
         fusion_s = _cpu_seconds() - started
         write_ply(work / f"cloud{count}.ply", cloud)
-        _print_row(f"{name}, {count} views agree", maps_s, megapixels, fusion_s, cloud, truth)
+        _print_row([f"{name}, {count} views agree", *maps, f"{fusion_s:.0f}"], cloud, truth)
     own = work / "bin" / "own.json"
     if own.exists():
         seconds = float(json.loads(own.read_text()))
-        _print_row(f"{name}, its own fusion", maps_s, megapixels, seconds, read_ply(own.with_suffix(".ply")), truth)
+        _print_row([f"{name}, its own fusion", *maps, f"{seconds:.0f}"], read_ply(own.with_suffix(".ply")), truth)
 
 
-def _print_row(label: str, maps_s: float, megapixels: float, fusion_s: float, cloud: PointCloud, truth: Path) -> None:
+def _print_row(label_and_times: Sequence[str], cloud: PointCloud, truth: Path) -> None:
     scores: Sequence[str] = ["" for _ in _THRESHOLDS_M]
     if len(cloud) and (truth / "gt.ply").exists():
         found = compare_clouds(
@@ -136,8 +141,7 @@ def _print_row(label: str, maps_s: float, megapixels: float, fusion_s: float, cl
             options=CompareOptions(thresholds_m=_THRESHOLDS_M),
         )
         scores = [f"{100 * s.accuracy:.1f} / {100 * s.completeness:.1f} / {100 * s.f_score:.1f}" for s in found.scores]
-    row = [label, f"{maps_s:,.0f}", f"{maps_s / megapixels:.1f}", f"{fusion_s:.0f}", f"{len(cloud):,}", *scores]
-    print("| " + _cells(row), flush=True)
+    print("| " + _cells([*label_and_times, f"{len(cloud):,}", *scores]), flush=True)
 
 
 def _cells(values: Iterable[str]) -> str:

@@ -5,7 +5,8 @@
     ============    a slanted plane, about 5 away
 
 The stand-ins (`tests/stand_ins/`) read their input by the rules of the program's own source, refuse what deviates, and
-answer with the true maps in the program's own format. OPENMVS may name the folder of OpenMVS's programs.
+answer with the true maps in the program's own format. OPENMVS and ACM may name the folders of OpenMVS's programs and of
+ACMP and its kin, which are tested too then, as is COLMAP where it finds a GPU.
 """
 
 from __future__ import annotations
@@ -80,11 +81,17 @@ def subject(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Subje
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     if name == "patchmatch":
         return Subject(name, MvsOptions(), exact=False)
-    if name == "real openmvs":
-        if "OPENMVS" not in os.environ:
-            pytest.skip("OPENMVS names no folder with OpenMVS's programs")
-        return Subject("openmvs", MvsOptions(openmvs_path=os.environ["OPENMVS"]), exact=False)
-    return Subject(name, install(name, tmp_path / "bin"))
+    if not name.startswith("real "):
+        return Subject(name, install(name, tmp_path / "bin"))
+    name = name.removeprefix("real ")
+    nowhere = str(tmp_path / "nowhere")
+    options = MvsOptions(
+        openmvs_path=os.environ.get("OPENMVS", nowhere), acmp_path=os.environ.get("ACM", nowhere), gpu_index="0"
+    )
+    available = get_backend(name).availability(options)
+    if not available.ok:
+        pytest.skip(available.reason)
+    return Subject(name, options, exact=False)
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +138,7 @@ def world_x(camera: MvsView, depth: np.ndarray) -> np.ndarray:
     return in_world[..., 0]
 
 
-@pytest.mark.parametrize("name", [*PROGRAMS, "patchmatch", "real openmvs"])
+@pytest.mark.parametrize("name", [*PROGRAMS, "patchmatch", *(f"real {name}" for name in PROGRAMS)])
 def test_maps_are_true_in_the_region_where_not_masked(
     name: str, job: MvsJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -15,7 +15,7 @@ from mvs_backends.base import MvsError, MvsJob, MvsOptions
 from mvs_backends.colmap import _groups, _try_out
 from mvs_backends.depth_range import depth_range
 from mvs_backends.hardware import installed_gpus
-from mvs_backends.trial import trials_file
+from mvs_backends.trial import trial_job, trials_file
 from tests.reference.plane_scene import plane_job, write_model
 from tests.unit.test_backend_contract import install
 
@@ -71,6 +71,20 @@ def test_auto_is_what_really_works(fault: str, why: str, options: MvsOptions, mo
     assert availability.ok == (not fault)
     assert why in availability.reason and "\n" not in availability.reason
     assert choose_backend("patchmatch", options) == "patchmatch"
+
+
+def test_trial_views_are_far_enough_apart_for_colmap(tmp_path: Path) -> None:
+    """COLMAP drops what its views see at less than 3 degrees: with 3.05 in the middle, a trial failed on a real GPU."""
+    job, depth = trial_job(tmp_path)
+    centers = [-view.cam_from_world[:, :3].T @ view.cam_from_world[:, 3] for view in job.views]
+    middle = job.views[1]
+    corners = np.array([(x, y, 1.0) for x in (0, middle.width) for y in (0, middle.height)])
+    points = centers[1] + depth * corners @ np.linalg.inv(middle.calibration).T
+    for neighbour in (centers[0], centers[2]):
+        rays = [
+            (points - center) / np.linalg.norm(points - center, axis=1)[:, None] for center in (centers[1], neighbour)
+        ]
+        assert (np.degrees(np.arccos((rays[0] * rays[1]).sum(axis=1))) > 3.5).all()
 
 
 def test_a_trial_is_remembered(options: MvsOptions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
